@@ -1,0 +1,220 @@
+"""Occupancy and visit maps on a regular grid (paper Sec. III-C, GOSELO's two inputs).
+
+Arrays are indexed [row, col] with row 0 at the LOWEST y and col 0 at the lowest x, so that indices grow with the
+world axes. A pixel's centre is at origin + (index + 0.5) * resolution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+RESOLUTION = 0.05
+MAX_SIDE = 16384
+_EDGE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyMap:
+    """A binary map of what is in the way. Whatever lies outside of it counts as occupied.
+
+    occupied: (rows, cols) bool, True where an obstacle is. Treat it as read-only: `clearance` is computed once.
+    resolution: side of a pixel [m].
+    origin: (x, y) of the lower-left corner of pixel [0, 0], world frame [m].
+
+    Raises ValueError for an array that is not 2-D bool, is empty or longer than 16384 pixels a side, for a resolution
+    that is not finite and positive, and for an origin that is not two finite numbers.
+    """
+
+    occupied: NDArray[np.bool_]
+    resolution: float = RESOLUTION
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_geometry(self.occupied.shape, self.resolution, self.origin)
+        if self.occupied.dtype != np.bool_:
+            raise ValueError(f"map: occupied has dtype {self.occupied.dtype}, it must be bool")
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """(xmin, xmax, ymin, ymax) of the map's outer edges [m]."""
+        rows, cols = self.occupied.shape
+        x, y = self.origin
+        return x, x + cols * self.resolution, y, y + rows * self.resolution
+
+    @cached_property
+    def clearance(self) -> NDArray[np.float32]:
+        """(rows, cols) float32 [m]: distance from a pixel's centre to the nearest occupied pixel or to outside the map.
+
+        Measured to the near edge of that pixel (centre to centre less half a pixel; exact along the axes and at most
+        0.21 pixels long on the diagonal), 0 in occupied pixels.
+        """
+        return self._padded_clearance[1:-1, 1:-1]
+
+    def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Points (..., 2) [m] inside the map's extent, edges included -> (...) bool; NaN is outside."""
+        points = np.asarray(points, dtype=np.float64)
+        xmin, xmax, ymin, ymax = self.extent
+        x, y = points[..., 0], points[..., 1]
+        return (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
+
+    def occupied_at(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Points (..., 2) [m] -> (...) bool: True where the pixel holding the point is occupied, and outside."""
+        points = np.asarray(points, dtype=np.float64)
+        inside = self.contains(points)
+        row, col = self.pixel_of(points)
+        return np.where(inside, self.occupied[row, col], True)
+
+    def pixel_of(self, points: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Points (..., 2) [m] -> (row, col), each (...) int, of the nearest pixel of the map (outside is clamped)."""
+        return nearest_pixel(points, self.occupied.shape, self.resolution, self.origin)
+
+    def clearance_at(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points (..., 2) [m] -> (...) [m]: the clearance, bilinear between pixel centres, 0 outside the map."""
+        points = np.asarray(points, dtype=np.float64)
+        inside = self.contains(points)
+        field = self._padded_clearance
+        rows, cols = self.occupied.shape
+        # + 0.5: the padding shifts indices by one, pixel centres by a half
+        u = np.where(inside, (points[..., 0] - self.origin[0]) / self.resolution + 0.5, 0.0)
+        v = np.where(inside, (points[..., 1] - self.origin[1]) / self.resolution + 0.5, 0.0)
+        col = np.clip(u.astype(np.intp), 0, cols)
+        row = np.clip(v.astype(np.intp), 0, rows)
+        s, t = u - col, v - row
+        low = (1.0 - s) * field[row, col] + s * field[row, col + 1]
+        high = (1.0 - s) * field[row + 1, col] + s * field[row + 1, col + 1]
+        return np.where(inside, (1.0 - t) * low + t * high, 0.0)
+
+    def is_free(self, points: ArrayLike, radius: float) -> NDArray[np.bool_]:
+        """Points (..., 2) [m] -> (...) bool: a disc of `radius` [m] there touches neither obstacle nor border."""
+        clearance = self.clearance_at(points)
+        return (clearance >= radius) & ~self.occupied_at(points)
+
+    def pixel_centers(self) -> NDArray[np.float64]:
+        """(rows, cols, 2) world frame [m]."""
+        rows, cols = self.occupied.shape
+        x = self.origin[0] + (np.arange(cols) + 0.5) * self.resolution
+        y = self.origin[1] + (np.arange(rows) + 0.5) * self.resolution
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @cached_property
+    def _padded_clearance(self) -> NDArray[np.float32]:
+        free = np.pad(~self.occupied, 1).view(np.uint8)
+        pixels = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return np.maximum(pixels - np.float32(0.5), np.float32(0.0)) * np.float32(self.resolution)
+
+
+class VisitMap:
+    """How often one robot has entered each pixel of an occupancy map (GOSELO's self-location history).
+
+    counts: (rows, cols) uint8, the same grid as the occupancy map's; an entry beyond 255 is not counted.
+    """
+
+    def __init__(self, occupancy: OccupancyMap) -> None:
+        self.resolution = occupancy.resolution
+        self.origin = occupancy.origin
+        self.counts: NDArray[np.uint8] = np.zeros(occupancy.occupied.shape, dtype=np.uint8)
+        self._extent = occupancy.extent
+        self._last_pixel = -1
+
+    def add(self, positions: ArrayLike) -> None:
+        """Follow the robot along positions (2,) or (M, 2), in order of time, world frame [m].
+
+        A pixel counts one when the robot comes into it; resting there adds nothing. Positions outside the map, or not
+        finite, count nowhere.
+        """
+        points = np.asarray(positions, dtype=np.float64).reshape(-1, 2)
+        if len(points) == 0:
+            return
+        xmin, xmax, ymin, ymax = self._extent
+        inside = (points[:, 0] >= xmin) & (points[:, 0] <= xmax) & (points[:, 1] >= ymin) & (points[:, 1] <= ymax)
+        row, col = nearest_pixel(points, self.counts.shape, self.resolution, self.origin)
+        pixel = np.where(inside, row * self.counts.shape[1] + col, -1)
+        before = np.concatenate(([self._last_pixel], pixel[:-1]))
+        entered, times = np.unique(pixel[(pixel != before) & (pixel >= 0)], return_counts=True)
+        flat = self.counts.reshape(-1)
+        flat[entered] = np.minimum(flat[entered].astype(np.int64) + times, 255)
+        self._last_pixel = int(pixel[-1])
+
+    def clear(self) -> None:
+        """Forget every visit, as at the start of an episode."""
+        self.counts = np.zeros_like(self.counts)
+        self._last_pixel = -1
+
+
+def empty_map(half_size: tuple[float, float], resolution: float = RESOLUTION) -> OccupancyMap:
+    """A free map that covers [-W, W] x [-H, H], half_size = (W, H) [m].
+
+    Half-sizes that are no whole number of half pixels are covered by rounding the pixel count up; the map stays
+    centred. Raises ValueError, before memory is taken, for sizes or a resolution that OccupancyMap refuses.
+    """
+    check_resolution(resolution)
+    if not (np.isfinite(half_size).all() and min(half_size) > 0):
+        raise ValueError(f"map: half size {half_size} m, both must be finite and positive")
+    cols, rows = (int(np.ceil(2.0 * h / resolution - 1e-6)) for h in half_size)
+    origin = (-0.5 * cols * resolution, -0.5 * rows * resolution)
+    check_geometry((rows, cols), resolution, origin)
+    return OccupancyMap(np.zeros((rows, cols), dtype=bool), resolution, origin)
+
+
+def draw_discs(
+    mask: NDArray[np.bool_], origin: tuple[float, float], resolution: float, centers: ArrayLike, radius: float
+) -> None:
+    """Mark in place the pixels whose centre lies in a disc: centers (K, 2) world frame [m], one radius [m]."""
+    centers = np.asarray(centers, dtype=np.float64).reshape(-1, 2)
+    corner = np.asarray(origin, dtype=np.float64)
+    first = np.floor((centers - radius - corner) / resolution).astype(np.intp)
+    index = first[:, None, :] + np.arange(int(np.ceil(2.0 * radius / resolution)) + 2)[None, :, None]
+    offset = corner + (index + 0.5) * resolution - centers[:, None, :]
+    inside = offset[:, :, None, 1] ** 2 + offset[:, None, :, 0] ** 2 <= (radius + _EDGE_TOLERANCE) ** 2
+    valid = (index >= 0) & (index < (mask.shape[1], mask.shape[0]))
+    inside &= valid[:, :, None, 1] & valid[:, None, :, 0]
+    disc, row, col = np.nonzero(inside)
+    mask[index[disc, row, 1], index[disc, col, 0]] = True
+
+
+def draw_boxes(
+    mask: NDArray[np.bool_],
+    origin: tuple[float, float],
+    resolution: float,
+    centers: ArrayLike,
+    half_extents: ArrayLike,
+) -> None:
+    """Mark in place the pixels whose centre lies in an upright box: centers (K, 2), half_extents (K, 2) [m]."""
+    centers = np.asarray(centers, dtype=np.float64).reshape(-1, 2)
+    halves = np.asarray(half_extents, dtype=np.float64).reshape(-1, 2) + _EDGE_TOLERANCE
+    limit = (mask.shape[1], mask.shape[0])
+    first = np.ceil((centers - halves - origin) / resolution - 0.5).astype(np.intp).clip(0, limit)
+    stop = (np.floor((centers + halves - origin) / resolution - 0.5).astype(np.intp) + 1).clip(0, limit)
+    for (col0, row0), (col1, row1) in zip(first, stop, strict=True):
+        mask[row0:row1, col0:col1] = True
+
+
+def nearest_pixel(
+    points: ArrayLike, shape: tuple[int, ...], resolution: float, origin: tuple[float, float]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Points (..., 2) [m] -> (row, col), each (...) int, of the nearest pixel of a grid of that shape; NaN gives 0."""
+    scaled = np.nan_to_num((np.asarray(points, dtype=np.float64) - origin) / resolution)
+    index = np.clip(np.floor(scaled), 0, (shape[1] - 1, shape[0] - 1)).astype(np.intp)
+    return index[..., 1], index[..., 0]
+
+
+def check_resolution(resolution: float) -> None:
+    """Raise ValueError unless a resolution [m per pixel] is finite and positive."""
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise ValueError(f"map: resolution {resolution} m per pixel, it must be finite and positive")
+
+
+def check_geometry(shape: tuple[int, ...], resolution: float, origin: tuple[float, float]) -> None:
+    """Raise ValueError, naming value and limit, unless an OccupancyMap of that geometry may exist."""
+    if len(shape) != 2:
+        raise ValueError(f"map: {len(shape)} dimensions (shape {tuple(shape)}), it must have 2")
+    if min(shape) < 1 or max(shape) > MAX_SIDE:
+        raise ValueError(f"map: {shape[1]} x {shape[0]} pixels, each side must be between 1 and {MAX_SIDE}")
+    check_resolution(resolution)
+    if len(origin) != 2 or not np.isfinite(origin).all():
+        raise ValueError(f"map: origin {tuple(origin)}, it must be two finite numbers (x, y) [m]")
