@@ -1,0 +1,139 @@
+"""GOSELO images: what is where, seen from the robot with the goal straight above (paper section III-C).
+
+Both maps are rotated and translated so that the goal G is straight above the position P and their midpoint M is the
+centre, cropped to squares of side L + 0.4 m, 2 L and 4 L, L = |GP|, and resampled to 64 x 64. Resampling preserves
+area: each crop is taken from the level of a mean pyramid that is at most twice as fine as its pixels, and the rest is
+averaged. Beyond the paper, `local` is a crop of fixed metric size around the robot at map resolution, because the
+others lose metric size to the normalisation by L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
+
+PIXELS = 64
+CHANNELS = ("obstacles_1", "obstacles_2", "obstacles_4", "visits_1", "visits_2", "visits_4")
+LOCAL_CHANNELS = (*CHANNELS, "obstacles_local")
+LOCAL_SIDE = 3.2
+"""Side of the local crop [m]: 64 pixels of 0.05 m."""
+MARGIN = 0.4
+"""Added to L for the first crop: 4 cells of 0.1 m."""
+MIN_DISTANCE = 0.1
+"""L is at least this [m], so that a robot at its goal still has a frame."""
+VISIT_CLIP = 4
+"""Entries into a pixel beyond this look the same."""
+
+
+@dataclass(frozen=True)
+class GoseloFrame:
+    """The frame of N images: origin at the robot, `up` towards the goal, `right` across; metres."""
+
+    position: np.ndarray
+    """(N, 2) world frame [m]."""
+    up: np.ndarray
+    """(N, 2) unit vector towards the goal."""
+    distance: np.ndarray
+    """(N,) L [m], at least `MIN_DISTANCE`."""
+
+    @classmethod
+    def of(cls, position: np.ndarray, goal: np.ndarray) -> GoseloFrame:
+        """The frame of robots at position (N, 2) with goals (N, 2); a robot on its goal looks along +y."""
+        delta = np.asarray(goal, dtype=np.float64) - position
+        length = np.linalg.norm(delta, axis=-1)
+        known = length > 1e-9
+        up = np.where(known[:, None], delta / np.where(known, length, 1.0)[:, None], [0.0, 1.0])
+        return cls(np.array(position, dtype=np.float64), up, np.maximum(length, MIN_DISTANCE))
+
+    @property
+    def right(self) -> np.ndarray:
+        """(N, 2) unit vector, `up` turned clockwise."""
+        return np.stack([self.up[:, 1], -self.up[:, 0]], axis=-1)
+
+    def to_world(self, points: np.ndarray) -> np.ndarray:
+        """(N, ..., 2) right, up [m] -> world frame [m]."""
+        extra = (1,) * (points.ndim - 2)
+        right, up, origin = (v.reshape(len(v), *extra, 2) for v in (self.right, self.up, self.position))
+        return origin + points[..., :1] * right + points[..., 1:] * up
+
+    def from_world(self, points: np.ndarray) -> np.ndarray:
+        """(N, ..., 2) world frame [m] -> right, up [m]; inverse of `to_world`."""
+        extra = (1,) * (points.ndim - 2)
+        right, up, origin = (v.reshape(len(v), *extra, 2) for v in (self.right, self.up, self.position))
+        delta = points - origin
+        return np.stack([(delta * right).sum(-1), (delta * up).sum(-1)], axis=-1)
+
+
+def images(
+    occupancy: Sequence[OccupancyMap],
+    visits: Sequence[VisitMap],
+    frame: GoseloFrame,
+    channels: tuple[str, ...] = CHANNELS,
+) -> np.ndarray:
+    """GOSELO images of N robots: (N, C, 64, 64) uint8, 255 = occupied or visited `VISIT_CLIP` times.
+
+    Row 0 is the top (towards the goal), column 0 the left. Outside the map counts as occupied.
+    """
+    if channels not in (CHANNELS, LOCAL_CHANNELS):
+        raise ValueError(f"unknown GOSELO channels {channels}; known: {CHANNELS} and {LOCAL_CHANNELS}")
+    out = np.empty((len(frame.position), len(channels), PIXELS, PIXELS), dtype=np.uint8)
+    right = frame.right
+    for row in range(len(out)):
+        length, up = frame.distance[row], frame.up[row]
+        levels = _pyramid(occupancy[row], visits[row])
+        middle = frame.position[row] + 0.5 * length * up
+        for crop, side in enumerate((length + MARGIN, 2.0 * length, 4.0 * length)):
+            both = _crop(levels, occupancy[row], middle, right[row], up, side)
+            out[row, crop], out[row, 3 + crop] = both[..., 0], both[..., 1]
+        if len(channels) > len(CHANNELS):
+            out[row, 6] = _crop(levels[:1], occupancy[row], frame.position[row], right[row], up, LOCAL_SIDE)[..., 0]
+    return out
+
+
+def _pyramid(occupancy: OccupancyMap, visits: VisitMap) -> list[np.ndarray]:
+    """Both maps as one two-channel image, then its means over 2 x 2, 4 x 4, ... pixels."""
+    level = np.empty((*occupancy.occupied.shape, 2), dtype=np.uint8)
+    np.multiply(occupancy.occupied, np.uint8(255), out=level[..., 0])
+    level[..., 1] = np.minimum(visits.counts, VISIT_CLIP) * (255 // VISIT_CLIP)
+    levels = [level]
+    while min(level.shape[:2]) >= 16:
+        odd = level.shape[0] % 2, level.shape[1] % 2
+        if any(odd):
+            level = cv2.copyMakeBorder(level, 0, odd[0], 0, odd[1], cv2.BORDER_CONSTANT, value=(255, 0))
+        level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        levels.append(level)
+    return levels
+
+
+def _crop(
+    levels: list[np.ndarray],
+    occupancy: OccupancyMap,
+    center: np.ndarray,
+    right: np.ndarray,
+    up: np.ndarray,
+    side: float,
+) -> np.ndarray:
+    """A square of `side` [m] around `center`, turned so that `up` points to the top: (64, 64, 2) uint8."""
+    pixel = side / PIXELS
+    depth = int(np.clip(np.floor(np.log2(pixel / occupancy.resolution) + 1e-9), 0, len(levels) - 1))
+    step = occupancy.resolution * 2**depth
+    samples = max(1, int(np.ceil(pixel / step - 1e-6)))  # per pixel and axis, so that none of the level is skipped
+    count, fine = PIXELS * samples, pixel / samples
+    across, down = right * fine / step, -up * fine / step
+    corner = center + (-side / 2 + fine / 2) * right + (side / 2 - fine / 2) * up
+    offset = (corner - np.asarray(occupancy.origin)) / step - 0.5
+    matrix = np.array([[across[0], down[0], offset[0]], [across[1], down[1], offset[1]]])
+    image = cv2.warpAffine(
+        levels[depth],
+        matrix,
+        (count, count),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(255, 0),
+    )
+    return image if samples == 1 else cv2.resize(image, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)

@@ -1,0 +1,102 @@
+"""The skill's observation: one list of terms, read by one builder, shipped with every model.
+
+Sizes are those of the paper's state table: 42 point, 54 car, 78 doggo. Values are raw SI units; `scale` is applied
+inside the network, so a robot never has to know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """One sensor: its name, number of values, unit, and the factor that brings it to order one."""
+
+    name: str
+    size: int
+    unit: str
+    scale: float
+
+
+@dataclass(frozen=True)
+class ObservationLayout:
+    """Order of the terms in the observation vector."""
+
+    terms: tuple[ObservationTerm, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(term.size for term in self.terms)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(term.name for term in self.terms)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(D,) float32, factor of each value."""
+        return np.concatenate([np.full(t.size, t.scale, dtype=np.float32) for t in self.terms])
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        ends = np.cumsum([0] + [term.size for term in self.terms])
+        return {t.name: slice(int(a), int(b)) for t, a, b in zip(self.terms, ends[:-1], ends[1:], strict=True)}
+
+    def build(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Concatenate named arrays (N, d) to observations (N, D) float32.
+
+        Raises:
+            KeyError: a term has no value.
+            ValueError: a value has the wrong size.
+        """
+        columns = []
+        for term in self.terms:
+            if term.name not in values:
+                raise KeyError(f"observation term {term.name!r} has no value; given: {', '.join(sorted(values))}")
+            value = np.asarray(values[term.name])
+            value = value.reshape(len(value), -1)
+            if value.shape[1] != term.size:
+                raise ValueError(f"observation term {term.name!r} has {value.shape[1]} values, expected {term.size}")
+            columns.append(value)
+        return np.concatenate(columns, axis=1).astype(np.float32)
+
+
+_BASE = (
+    ObservationTerm("accelerometer", 3, "m/s^2", 0.1),
+    ObservationTerm("velocimeter", 3, "m/s", 1.0),
+    ObservationTerm("gyro", 3, "rad/s", 0.3),
+    ObservationTerm("magnetometer", 3, "MuJoCo units", 2.0),
+    ObservationTerm("lidar", 10, "closeness", 1.0),
+)
+_WAYPOINTS = ObservationTerm("waypoints", 20, "m, body frame", 2.0)
+_GOAL = ObservationTerm("goal", 2, "m, body frame", 0.5)
+_EXTRA: dict[str, tuple[ObservationTerm, ...]] = {
+    "point": (),
+    "car": (
+        ObservationTerm("rear_rotation", 9, "rotation matrix", 1.0),
+        ObservationTerm("rear_velocity", 3, "rad/s", 0.1),
+    ),
+    "doggo": (
+        ObservationTerm("joint_sin", 12, "", 1.0),
+        ObservationTerm("joint_cos", 12, "", 1.0),
+        ObservationTerm("joint_velocity", 12, "rad/s", 0.1),
+    ),
+}
+
+
+def observation_layout(robot: str, guidance: str = "waypoints") -> ObservationLayout:
+    """The layout of a robot's skill.
+
+    Args:
+        robot: "point", "car" or "doggo".
+        guidance: "waypoints" (path-conditioned) or "goal" (the paper's baseline).
+    """
+    if robot not in _EXTRA:
+        raise ValueError(f"unknown robot {robot!r}; known: {', '.join(_EXTRA)}")
+    if guidance not in ("waypoints", "goal"):
+        raise ValueError(f"unknown guidance {guidance!r}; known: waypoints, goal")
+    return ObservationLayout(_BASE + ((_WAYPOINTS if guidance == "waypoints" else _GOAL),) + _EXTRA[robot])

@@ -1,0 +1,313 @@
+"""The option: a plan, the rule that ends it, and the agent that follows it (paper section IV-C).
+
+The waypoint generator is the option's policy over plans; the skill runs inside it. Training, evaluation and robot
+all step the same `WaypointOption`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+
+from hiernav.nav import path
+from hiernav.nav.frames import world_to_body
+from hiernav.nav.observation import ObservationLayout
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
+
+Skill = Callable[[np.ndarray], np.ndarray]
+"""Observations (N, D) float32 -> actions (N, A) float32 in [-1, 1]."""
+
+
+class TerminationReason(IntEnum):
+    """Why a plan ended; NONE while it goes on."""
+
+    NONE = 0
+    START = 1
+    D_UPDATE = 2
+    HALF_INDEX = 3
+    INVALID = 4
+    GOAL = 5
+
+
+@dataclass(frozen=True)
+class ReplanRule:
+    """When an option ends: a rule without learned parts.
+
+    If several conditions hold the first of `start`, `goal`, `invalid`, `d_update`, `half_index` is the reason.
+    """
+
+    d_update: float = 0.3
+    """Distance to the closest waypoint above which the plan is given up [m]."""
+    half_fraction: float = 0.5
+    """Share of the waypoints behind the robot above which the plan is used up."""
+    invalid: bool = True
+    """Whether a remaining plan that meets the current map is given up (beyond the paper)."""
+    period: int | None = None
+    """Replan every so many steps instead of by distance and index (the paper's comparison)."""
+
+    def __call__(
+        self,
+        distance: np.ndarray,
+        index: np.ndarray,
+        count: int,
+        *,
+        age: np.ndarray,
+        blocked: np.ndarray,
+        at_goal: np.ndarray,
+        started: np.ndarray,
+    ) -> np.ndarray:
+        """Termination reason of each row.
+
+        Args:
+            distance: (N,) to the closest waypoint [m]; NaN counts as too far.
+            index: (N,) of the closest waypoint; 0 is the position the plan was made from.
+            count: number of waypoints of a plan.
+            age: (N,) control steps since the plan was made.
+            blocked: (N,) bool, the remaining plan meets the map.
+            at_goal: (N,) bool.
+            started: (N,) bool, False before the first plan of an episode.
+
+        Returns:
+            (N,) int8 of `TerminationReason`.
+        """
+        if self.period is None:
+            too_far = ~(distance <= self.d_update)
+            used_up = index > self.half_fraction * count
+        else:
+            too_far, used_up = np.isnan(distance), age >= self.period
+        reason = np.select(
+            [~started, at_goal, blocked & self.invalid, too_far, used_up],
+            [
+                TerminationReason.START,
+                TerminationReason.GOAL,
+                TerminationReason.INVALID,
+                TerminationReason.D_UPDATE,
+                TerminationReason.HALF_INDEX,
+            ],
+            TerminationReason.NONE,
+        )
+        return reason.astype(np.int8)
+
+
+@dataclass(frozen=True)
+class PlanQuery:
+    """What a planner is asked for M robots at once; all arrays in the world frame [m]."""
+
+    position: np.ndarray
+    """(M, 2)"""
+    goal: np.ndarray
+    """(M, 2)"""
+    occupancy: Sequence[OccupancyMap]
+    visits: Sequence[VisitMap]
+    previous: np.ndarray
+    """(M, K, 2) plan that is being replaced, NaN where there is none."""
+
+
+class Planner(Protocol):
+    """Proposes waypoints. A row of NaN says that no plan was found."""
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        """(M, K, 2) waypoints in the world frame [m]."""
+        ...
+
+
+@dataclass
+class OptionStep:
+    """Outcome of one control step of `WaypointOption`."""
+
+    reason: np.ndarray
+    """(N,) int8 `TerminationReason`."""
+    plan: np.ndarray
+    """(N, K, 2) active plan, world frame [m]."""
+    start: np.ndarray
+    """(N, 2) position it was made from [m]."""
+    plan_seconds: float = 0.0
+    """Time the planner took."""
+
+
+@dataclass
+class WaypointOption:
+    """Plans of N robots: when each one ends, a new one is asked for.
+
+    A row whose planner finds nothing (NaN) keeps the plan it has, or holds its position if it has none; such
+    refusals are counted.
+    """
+
+    planner: Planner
+    num_rows: int
+    rule: ReplanRule = field(default_factory=ReplanRule)
+    num_waypoints: int = 10
+    goal_radius: float = 0.3
+    """A robot this close to its goal has reached it [m]."""
+    sweep_radius: float = 0.1
+    """Radius with which the remaining plan is swept for `invalid` [m]."""
+
+    def __post_init__(self) -> None:
+        shape = (self.num_rows, self.num_waypoints, 2)
+        self.plan = np.full(shape, np.nan)
+        self.start = np.full((self.num_rows, 2), np.nan)
+        self.started = np.zeros(self.num_rows, dtype=bool)
+        self.age = np.zeros(self.num_rows, dtype=np.int64)
+        self.visits: list[VisitMap | None] = [None] * self.num_rows
+        self.counts = np.zeros((self.num_rows, len(TerminationReason)), dtype=np.int64)
+        self.refused = np.zeros(self.num_rows, dtype=np.int64)
+
+    def reset(self, rows: np.ndarray | None = None) -> None:
+        """Forget plans, visits and counts of some rows (all by default), as at the start of an episode."""
+        rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
+        self.plan[rows], self.start[rows] = np.nan, np.nan
+        self.started[rows], self.age[rows] = False, 0
+        self.counts[rows], self.refused[rows] = 0, 0
+        for row in rows:
+            self.visits[row] = None
+
+    def drop(self, rows: np.ndarray | None = None) -> None:
+        """Give up the plans of some rows without forgetting the episode, as when the goal has changed."""
+        self.started[slice(None) if rows is None else rows] = False
+
+    def step(self, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]) -> OptionStep:
+        """One control step: end the options that are due and plan anew for their rows.
+
+        Args:
+            position: (N, 2) world frame [m].
+            goal: (N, 2) world frame [m].
+            occupancy: N maps as they are now.
+        """
+        position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+        for row in range(self.num_rows):
+            visits = self.visits[row]
+            if visits is None:
+                visits = self.visits[row] = VisitMap(occupancy[row])
+            visits.add(position[row])
+        self.age += 1
+        reason = self._reasons(position, goal, occupancy)
+        self.counts[np.arange(self.num_rows), reason] += 1
+        rows = np.flatnonzero((reason != TerminationReason.NONE) & (reason != TerminationReason.GOAL))
+        began = time.perf_counter()
+        if len(rows):
+            self._replan(rows, position, goal, occupancy)
+        return OptionStep(reason, self.plan.copy(), self.start.copy(), time.perf_counter() - began)
+
+    def line(self) -> np.ndarray:
+        """(N, K + 1, 2) active plans with the position they were made from in front."""
+        return path.polyline(self.start, self.plan)
+
+    def _reasons(self, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]) -> np.ndarray:
+        line = self.line()
+        index, distance = path.nearest_vertex(position[:, None], line)
+        blocked = np.zeros(self.num_rows, dtype=bool)
+        if self.rule.invalid:
+            for row in np.flatnonzero(self.started):
+                rest = self.plan[row, max(index[row, 0] - 1, 0) :]
+                blocked[row] = not occupancy[row].is_free(rest, self.sweep_radius).all()
+            # a blocked plan that was made where the robot still stands would only be proposed again
+            blocked &= (self.age > 1) & (np.linalg.norm(position - self.start, axis=-1) > 0.05)
+        return self.rule(
+            distance[:, 0],
+            index[:, 0],
+            self.num_waypoints,
+            age=self.age,
+            blocked=blocked,
+            at_goal=np.linalg.norm(position - goal, axis=-1) <= self.goal_radius,
+            started=self.started,
+        )
+
+    def _replan(
+        self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
+    ) -> None:
+        query = PlanQuery(
+            position=position[rows],
+            goal=goal[rows],
+            occupancy=[occupancy[row] for row in rows],
+            visits=[visits for row in rows if (visits := self.visits[row]) is not None],
+            previous=np.where(self.started[rows][:, None, None], self.plan[rows], np.nan),
+        )
+        plan = np.asarray(self.planner.plan(query), dtype=np.float64)
+        expected = (len(rows), self.num_waypoints, 2)
+        if plan.shape != expected:
+            raise ValueError(f"planner returned waypoints of shape {plan.shape}, expected {expected}")
+        good = np.isfinite(plan).all(axis=(1, 2))
+        self.refused[rows[~good]] += 1
+        hold = ~good & ~np.isfinite(self.plan[rows]).all(axis=(1, 2))
+        plan[hold] = position[rows[hold]][:, None]
+        accepted = good | hold
+        self.plan[rows[accepted]] = plan[accepted]
+        self.start[rows[accepted]] = position[rows[accepted]]
+        self.started[rows[good]] = True
+        self.age[rows] = 0
+
+
+@dataclass
+class AgentStep:
+    """What the agent decided in one control step."""
+
+    action: np.ndarray
+    """(N, A) float32 in [-1, 1]."""
+    observation: np.ndarray
+    """(N, D) float32."""
+    option: OptionStep
+
+    @property
+    def reason(self) -> np.ndarray:
+        return self.option.reason
+
+    @property
+    def plan(self) -> np.ndarray:
+        return self.option.plan
+
+    @property
+    def replanned(self) -> np.ndarray:
+        """(N,) bool."""
+        return (self.reason != TerminationReason.NONE) & (self.reason != TerminationReason.GOAL)
+
+    @property
+    def plan_seconds(self) -> float:
+        return self.option.plan_seconds
+
+
+@dataclass
+class HierarchicalAgent:
+    """Option and skill together: from sensors, goal and map to an action."""
+
+    option: WaypointOption
+    skill: Skill
+    layout: ObservationLayout
+
+    def reset(self, rows: np.ndarray | None = None) -> None:
+        """Start new episodes in some rows (all by default)."""
+        self.option.reset(rows)
+
+    def act(
+        self,
+        pose: np.ndarray,
+        terms: Mapping[str, np.ndarray],
+        goal: np.ndarray,
+        occupancy: Sequence[OccupancyMap],
+    ) -> AgentStep:
+        """One control step.
+
+        Args:
+            pose: (N, 3) world frame [m, m, rad].
+            terms: the robot's sensors by name, (N, d) each; waypoints and goal are added here.
+            goal: (N, 2) world frame [m].
+            occupancy: N maps as they are now.
+        """
+        step = self.option.step(pose[:, :2], goal, occupancy)
+        observation = self.layout.build(guided(terms, pose, step.plan, goal))
+        return AgentStep(self.skill(observation), observation, step)
+
+
+def guided(
+    terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Add what guides the skill to its sensors: waypoints and goal, re-expressed in the present body frame."""
+    return {
+        **terms,
+        "waypoints": world_to_body(plan, pose).reshape(len(pose), -1),
+        "goal": world_to_body(np.asarray(goal, dtype=np.float64)[:, None], pose)[:, 0],
+    }

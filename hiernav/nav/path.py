@@ -1,0 +1,121 @@
+"""Features of a path: nearest neighbour index, distance, progress (paper section IV-B).
+
+A plan is turned into a polyline by prepending the position it was made from. Everything here is a pure function
+of arrays, batch first, so that training, evaluation and robot share it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+_TINY = 1e-9
+
+
+def polyline(start: np.ndarray, plan: np.ndarray) -> np.ndarray:
+    """Prepend the position a plan was made from: (N, 2), (N, K, 2) -> (N, K + 1, 2)."""
+    return np.concatenate([start[:, None, :], plan], axis=1)
+
+
+def divide(line: np.ndarray, spacing: float) -> np.ndarray:
+    """Divide polylines at regular intervals of arc length (paper Fig. 3).
+
+    Args:
+        line: (N, V, 2) vertices [m].
+        spacing: distance between the new vertices along the line [m].
+
+    Returns:
+        (N, W, 2), where W fits the longest line; shorter ones repeat their last point.
+    """
+    if not spacing > 0:
+        raise ValueError(f"spacing must be positive, got {spacing} m")
+    arc = arc_lengths(line)
+    count = int(np.floor(np.max(arc[:, -1], initial=0.0) / spacing + 1e-6)) + 2
+    stations = np.minimum(np.arange(count) * spacing, arc[:, -1:])
+    return point_at(line, stations, arc)
+
+
+def arc_lengths(line: np.ndarray) -> np.ndarray:
+    """Arc length from the first vertex to each vertex: (N, V, 2) -> (N, V) [m]."""
+    steps = np.linalg.norm(np.diff(line, axis=1), axis=-1)
+    return np.concatenate([np.zeros((len(line), 1)), np.cumsum(steps, axis=1)], axis=1)
+
+
+def point_at(line: np.ndarray, stations: np.ndarray, arc: np.ndarray | None = None) -> np.ndarray:
+    """Points of polylines at given arc lengths, clamped to both ends.
+
+    Args:
+        line: (N, V, 2) vertices [m].
+        stations: (N, S) arc lengths [m].
+        arc: result of `arc_lengths(line)`, if already known.
+
+    Returns:
+        (N, S, 2) points [m].
+    """
+    arc = arc_lengths(line) if arc is None else arc
+    segment = np.clip((arc[:, None, :] <= stations[:, :, None]).sum(-1) - 1, 0, line.shape[1] - 2)
+    rows = np.arange(len(line))[:, None]
+    begin, length = arc[rows, segment], arc[rows, segment + 1] - arc[rows, segment]
+    t = np.clip((stations - begin) / np.maximum(length, _TINY), 0.0, 1.0)[..., None]
+    return (1.0 - t) * line[rows, segment] + t * line[rows, segment + 1]
+
+
+def nearest_vertex(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest neighbour index NNI and distance D of points to the vertices of their row.
+
+    Args:
+        points: (N, M, 2) [m].
+        vertices: (N, V, 2) [m].
+
+    Returns:
+        index (N, M) of the first nearest vertex, distance (N, M) [m]; NaN points give a NaN distance.
+    """
+    squared = np.square(points[:, :, None, :] - vertices[:, None, :, :]).sum(-1)
+    index = squared.argmin(-1)
+    return index, np.sqrt(np.take_along_axis(squared, index[..., None], axis=-1)[..., 0])
+
+
+def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, spacing: float) -> np.ndarray:
+    """d_path: largest distance between the step's motion and the divided plan (paper section IV-B).
+
+    Args:
+        before, after: (N, 2) robot position at both ends of the control step [m].
+        vertices: (N, V, 2) divided plan [m].
+        spacing: at which the motion is divided [m].
+
+    Returns:
+        (N,) max over the motion of the distance to the closest plan vertex [m].
+    """
+    length = np.linalg.norm(after - before, axis=-1)
+    count = int(np.ceil(np.max(length, initial=0.0) / spacing - 1e-9)) + 1
+    t = np.linspace(0.0, 1.0, max(count, 2))[None, :, None]
+    motion = (1.0 - t) * before[:, None, :] + t * after[:, None, :]
+    return nearest_vertex(motion, vertices)[1].max(axis=1)
+
+
+def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Arc length of the foot of each point on its polyline, negative before the first vertex.
+
+    The first edge is continued backwards without end, so that backing away from a fresh plan costs what coming
+    forward again pays. The value is a function of position alone: over any closed motion its changes sum to zero.
+
+    Args:
+        points: (N, 2) [m].
+        line: (N, V, 2) polyline [m].
+
+    Returns:
+        (N,) [m], at most the length of the line.
+    """
+    begin, edge = line[:, :-1], np.diff(line, axis=1)
+    squared = np.square(edge).sum(-1)
+    t = ((points[:, None, :] - begin) * edge).sum(-1) / np.maximum(squared, _TINY)
+    foot = begin + np.clip(t, 0.0, 1.0)[..., None] * edge
+    nearest = np.square(points[:, None, :] - foot).sum(-1).argmin(-1)
+    rows = np.arange(len(line))
+    arc, length = arc_lengths(line), np.sqrt(squared)
+    along = arc[rows, nearest] + np.clip(t[rows, nearest], 0.0, 1.0) * length[rows, nearest]
+
+    # before the start: signed distance along the first edge that has a direction
+    first = (length > 1e-6).argmax(axis=1)
+    direction = edge[rows, first] / np.maximum(length[rows, first], _TINY)[:, None]
+    behind = ((points - line[:, 0]) * direction).sum(-1)
+    return np.where((along <= 0.0) & (behind < 0.0), behind, along)

@@ -1,0 +1,162 @@
+"""Planners behind one protocol: shortest paths, a waypoint network on GOSELO images, and verification of either."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hiernav.nav import goselo
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.option import Planner, PlanQuery
+from hiernav.nav.path import divide, polyline
+from hiernav.nav.search import PathField
+
+Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
+scores (M, H) of H hypotheses."""
+
+
+@dataclass
+class ShortestPathPlanner:
+    """The expert: first waypoints of the smoothed shortest path ("astar" on the command line).
+
+    One field per map and goal answers every query on that map, so only the first query of an episode searches.
+    """
+
+    radius: float = 0.1
+    """Disc that must fit on the path [m]."""
+    soft_margin: float = 0.15
+    """Further clearance worth a detour [m]."""
+    num_waypoints: int = 10
+    spacing: float = 0.1
+    """Distance between waypoints along the path [m]."""
+    cache_size: int = 256
+    _fields: OrderedDict[tuple[int, float, float], PathField] = field(default_factory=OrderedDict, repr=False)
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        plans = np.full((len(query.position), self.num_waypoints, 2), np.nan)
+        for row, (position, goal, occupancy) in enumerate(
+            zip(query.position, query.goal, query.occupancy, strict=True)
+        ):
+            if not np.isfinite(position).all():
+                continue
+            waypoints = self.field(occupancy, goal).waypoints(position, self.num_waypoints, self.spacing)
+            if waypoints is not None:
+                plans[row] = waypoints
+        return plans
+
+    def field(self, occupancy: OccupancyMap, goal: np.ndarray) -> PathField:
+        """The shortest-path field of a map and a goal (2,) [m]."""
+        # the field holds its map, so the identity cannot be taken over by another one while the entry lives
+        key = (id(occupancy), float(goal[0]), float(goal[1]))
+        if key not in self._fields:
+            self._fields[key] = PathField(occupancy, goal, self.radius, self.soft_margin)
+            if len(self._fields) > self.cache_size:
+                self._fields.popitem(last=False)
+        self._fields.move_to_end(key)
+        return self._fields[key]
+
+
+@dataclass
+class GoseloPlanner:
+    """A waypoint network: GOSELO image in, the best of its hypotheses out."""
+
+    network: Network
+    channels: tuple[str, ...] = goselo.CHANNELS
+    radius: float = 0.1
+    """Clearance a hypothesis should keep [m]."""
+    hysteresis: float = 0.5
+    """Score a hypothesis gains by lying on the plan it replaces; keeps plans from flipping sides."""
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        frame = goselo.GoseloFrame.of(query.position, query.goal)
+        image = goselo.images(query.occupancy, query.visits, frame, self.channels)
+        waypoints, scores = self.network(image, frame.distance.astype(np.float32))
+        return self.select(frame.to_world(waypoints.astype(np.float64)), scores.astype(np.float64), query)
+
+    def select(self, candidates: np.ndarray, scores: np.ndarray, query: PlanQuery) -> np.ndarray:
+        """Pick one hypothesis per row: free of collision first, then score and agreement with the previous plan.
+
+        Args:
+            candidates: (M, H, K, 2) world frame [m].
+            scores: (M, H), log-probabilities or the like.
+        """
+        if candidates.shape[1] == 1:
+            return candidates[:, 0]
+        clearance = np.stack(
+            [
+                swept_clearance(np.broadcast_to(position, (len(plans), 2)), plans, occupancy)
+                for position, plans, occupancy in zip(query.position, candidates, query.occupancy, strict=True)
+            ]
+        )
+        apart = np.linalg.norm(candidates[:, :, -1] - query.previous[:, None, -1], axis=-1)
+        agreement = np.exp(-np.nan_to_num(apart, nan=np.inf) / 0.3)
+        shortfall = np.clip(self.radius - clearance, 0.0, None) / self.radius
+        best = (scores + self.hysteresis * agreement - 100.0 * shortfall).argmax(axis=1)
+        return candidates[np.arange(len(candidates)), best]
+
+
+@dataclass
+class VerifiedPlanner:
+    """Sweeps every proposal against the map and replaces the ones that collide by the shortest path.
+
+    Counts proposals, repairs and refusals (a collision where no path exists either; the row is NaN then).
+    """
+
+    planner: Planner
+    repair: ShortestPathPlanner
+    radius: float = 0.1
+    """Disc that must fit along the plan [m]."""
+    proposals: int = 0
+    repairs: int = 0
+    refusals: int = 0
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        plans = self.planner.plan(query)
+        self.proposals += len(plans)
+        clearance = np.array(
+            [
+                swept_clearance(position[None], plan[None], occupancy)[0]
+                for position, plan, occupancy in zip(query.position, plans, query.occupancy, strict=True)
+            ]
+        )
+        bad = np.flatnonzero(~(clearance >= self.radius))
+        if len(bad):
+            part = PlanQuery(
+                query.position[bad],
+                query.goal[bad],
+                [query.occupancy[row] for row in bad],
+                [query.visits[row] for row in bad],
+                query.previous[bad],
+            )
+            plans = plans.copy()
+            plans[bad] = self.repair.plan(part)
+            refused = int(np.isnan(plans[bad]).any(axis=(1, 2)).sum())
+            self.refusals += refused
+            self.repairs += len(bad) - refused
+        return plans
+
+
+def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap, spacing: float = 0.05) -> np.ndarray:
+    """Smallest clearance on the way along plans, beyond what the start itself lacks.
+
+    The first 0.15 m do not count where they lead away from an obstacle that the robot already stands too close to.
+
+    Args:
+        start: (M, 2) [m].
+        plans: (M, K, 2) [m]; NaN gives NaN.
+
+    Returns:
+        (M,) [m].
+    """
+    finite = np.isfinite(plans).all(axis=(1, 2))
+    line = polyline(start, np.where(finite[:, None, None], plans, start[:, None]))
+    clearance = occupancy.clearance_at(divide(line, spacing))
+    escape = clearance[:, :1]
+    leaving = np.arange(clearance.shape[1]) * spacing < 0.15
+    excused = leaving & (np.diff(clearance, axis=1, prepend=escape) >= -1e-6) & (clearance >= escape - 1e-6)
+    return np.where(finite, np.where(excused, np.inf, clearance).min(axis=1, initial=np.inf), np.nan)
+

@@ -1,0 +1,207 @@
+"""Shortest paths on a grid, and the shortcuts that make them smooth (paper section IV-A, appendix).
+
+One field per map and goal labels every start in it. The cost of a path is its length times a factor that grows
+where the clearance falls below `radius + soft_margin`, so paths keep off obstacles where there is room and still
+pass where there is not. With `soft_margin = 0` the cost is the length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from hiernav.nav.occupancy import OccupancyMap
+
+CELL = 0.1  # [m], planning grid of the paper
+_SAMPLE = 0.05  # [m], at which straight lines are checked against the map
+_LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line
+
+
+class PathField:
+    """Cost to go from every cell of a 0.1 m grid to one goal; 8-connected, no corner cutting.
+
+    Args:
+        occupancy: the map.
+        goal: (2,) world frame [m]; the nearest traversable cell stands for it.
+        radius: disc that must fit everywhere on a path [m].
+        soft_margin: further clearance that is worth a detour [m].
+        soft_weight: relative extra cost of a metre at clearance `radius`.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyMap,
+        goal: np.ndarray,
+        radius: float,
+        soft_margin: float = 0.0,
+        soft_weight: float = 4.0,
+    ) -> None:
+        self.occupancy, self.radius = occupancy, radius
+        self.soft_margin, self.soft_weight = soft_margin, soft_weight
+        self.goal = np.array(goal, dtype=np.float64)
+        self._centers, self._shape = _cell_centers(occupancy)
+        clearance = occupancy.clearance_at(self._centers)
+        self._free = clearance >= radius
+        self._cost, self._next = np.full(len(self._free), np.inf), np.full(len(self._free), -1)
+        self.goal_cell = _nearest(self._centers, self._free, self.goal)
+        if self.goal_cell is not None:
+            graph = _grid_graph(self._free.reshape(self._shape), self._factor(clearance).reshape(self._shape))
+            self._cost, self._next = dijkstra(graph, indices=self.goal_cell, return_predecessors=True)
+        self._entry: np.ndarray | None = None
+
+    def distance_at(self, points: np.ndarray) -> np.ndarray:
+        """Cost to go [m] of the cells that (M, 2) points lie in; inf where no path starts."""
+        return self._cost[self._cells(points)]
+
+    def path_from(self, start: np.ndarray, max_vertices: int | None = None) -> np.ndarray | None:
+        """Vertices (K, 2) from a start to the goal, both included; None if there is no path.
+
+        A start whose own cell is not traversable (too close to an obstacle) is led to the nearest cell that is.
+        With `max_vertices` the path ends early, at a cell on the way.
+        """
+        cell = self._entries()[self._cells(np.asarray(start)[None])[0]]
+        if cell < 0:
+            return None
+        cells = [cell]
+        limit = max_vertices or len(self._cost)
+        while cell != self.goal_cell and len(cells) < limit:
+            cell = self._next[cell]
+            cells.append(cell)
+        vertices = self._centers[cells[1:] if len(cells) > 1 else cells]  # the first centre may lie behind the start
+        if cell == self.goal_cell:
+            vertices = np.concatenate([vertices[:-1], self.goal[None]])
+        return np.concatenate([np.asarray(start, dtype=np.float64)[None], vertices])
+
+    def line_cost(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Cost of straight lines: (M, 2), (M, 2) -> (M,) [m]; inf where the disc does not fit."""
+        delta = end - begin
+        length = np.sqrt((delta * delta).sum(-1))
+        counts = np.ceil(length / _SAMPLE).astype(np.int64) + 2
+        firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        line = np.repeat(np.arange(len(length)), counts)
+        t = (np.arange(len(line)) - firsts[line]) / (counts - 1)[line]
+        clearance = self.occupancy.clearance_at(begin[line] + t[:, None] * delta[line])
+        mean = np.add.reduceat(self._factor(clearance), firsts) / counts
+        return np.where(np.minimum.reduceat(clearance, firsts) >= self.radius, length * mean, np.inf)
+
+    def waypoints(self, start: np.ndarray, count: int = 10, spacing: float = 0.1) -> np.ndarray | None:
+        """The first `count` waypoints (count, 2) of the smoothed path, padded with the goal; None without a path."""
+        path = self.path_from(start, max_vertices=int(3 * count * spacing / CELL) + 4)
+        if path is None:
+            return None
+        return resample(self.smooth(path, count * spacing), count, spacing)
+
+    def smooth(self, path: np.ndarray, length: float = np.inf) -> np.ndarray:
+        """Replace stretches of a path by the longest straight lines that cost no more, until `length` is covered."""
+        here, covered = 0, 0.0
+        kept, cost = [path[0]], self.distance_at(path)
+        while here < len(path) - 1 and covered < length:
+            ahead = here + _LOOK_AHEAD[_LOOK_AHEAD < len(path) - here]
+            straight = self.line_cost(np.broadcast_to(path[here], (len(ahead), 2)), path[ahead])
+            # a cell may be half a cell off the vertex in it at both ends
+            good = ahead[np.isfinite(straight) & (straight <= cost[here] - cost[ahead] + CELL)]
+            following = int(good[-1]) if len(good) else here + 1
+            covered += float(np.linalg.norm(path[following] - path[here]))
+            here = following
+            kept.append(path[here])
+        return np.array(kept)
+
+    def _visible(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return np.isfinite(self.line_cost(begin, end))
+
+    def _factor(self, clearance: np.ndarray) -> np.ndarray:
+        if self.soft_margin <= 0:
+            return np.ones_like(clearance, dtype=np.float64)
+        lack = np.clip(1.0 - (clearance - self.radius) / self.soft_margin, 0.0, 1.0)
+        return 1.0 + self.soft_weight * lack**2
+
+    def _cells(self, points: np.ndarray) -> np.ndarray:
+        index = np.floor((points - np.asarray(self.occupancy.origin)) / CELL).astype(np.int64)
+        rows, cols = self._shape
+        return np.clip(index[..., 1], 0, rows - 1) * cols + np.clip(index[..., 0], 0, cols - 1)
+
+    def _entries(self) -> np.ndarray:
+        """For every cell the nearest one from which the goal can be reached, -1 if there is none."""
+        if self._entry is None:
+            reachable = np.isfinite(self._cost).reshape(self._shape)
+            if not reachable.any():
+                self._entry = np.full(len(self._cost), -1)
+            else:
+                row, col = ndimage.distance_transform_edt(~reachable, return_distances=False, return_indices=True)
+                self._entry = (row * self._shape[1] + col).ravel()
+        return self._entry
+
+
+def is_solvable(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, radius: float) -> bool:
+    """Whether a disc of `radius` [m] can move from start (2,) to goal (2,) through the map."""
+    ends = np.stack([np.asarray(start)[:2], np.asarray(goal)[:2]])
+    if not (occupancy.clearance_at(ends) >= radius).all():
+        return False
+    centers, shape = _cell_centers(occupancy)
+    free = occupancy.clearance_at(centers) >= radius
+    cells = [_nearest(centers, free, end) for end in ends]
+    if cells[0] is None or cells[1] is None:
+        return False
+    labels = connected_components(_grid_graph(free.reshape(shape), np.ones(shape)), directed=False)[1]
+    return bool(labels[cells[0]] == labels[cells[1]])
+
+
+def resample(path: np.ndarray, count: int, spacing: float) -> np.ndarray:
+    """Points every `spacing` along a path (K, 2), first one excluded, padded with its end: (count, 2)."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    stations = np.minimum(np.arange(1, count + 1) * spacing, arc[-1])
+    return np.stack([np.interp(stations, arc, path[:, 0]), np.interp(stations, arc, path[:, 1])], axis=-1)
+
+
+def random_shortcuts(
+    path: np.ndarray, field: PathField, rng: np.random.Generator, tries: int = 30, spacing: float = CELL
+) -> np.ndarray:
+    """The paper's smoothing: pick two vertices, replace what lies between by evenly spaced points if they are free."""
+    for _ in range(tries):
+        if len(path) < 3:
+            break
+        i, j = np.sort(rng.choice(len(path), size=2, replace=False))
+        if j - i < 2 or not field._visible(path[i : i + 1], path[j : j + 1])[0]:
+            continue
+        pieces = max(1, int(np.ceil(np.linalg.norm(path[j] - path[i]) / spacing)))
+        line = path[i] + np.linspace(0.0, 1.0, pieces + 1)[1:-1, None] * (path[j] - path[i])
+        path = np.concatenate([path[: i + 1], line, path[j:]])
+    return path
+
+
+def _cell_centers(occupancy: OccupancyMap) -> tuple[np.ndarray, tuple[int, int]]:
+    """Centres (rows * cols, 2) of the planning cells and the shape of their grid."""
+    height, width = (side * occupancy.resolution for side in occupancy.occupied.shape)
+    rows, cols = max(1, round(height / CELL)), max(1, round(width / CELL))
+    x = occupancy.origin[0] + (np.arange(cols) + 0.5) * CELL
+    y = occupancy.origin[1] + (np.arange(rows) + 0.5) * CELL
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), (rows, cols)
+
+
+def _nearest(centers: np.ndarray, free: np.ndarray, point: np.ndarray) -> int | None:
+    candidates = np.flatnonzero(free)
+    if not len(candidates):
+        return None
+    return int(candidates[np.square(centers[candidates] - point).sum(-1).argmin()])
+
+
+def _grid_graph(free: np.ndarray, factor: np.ndarray) -> csr_matrix:
+    """Sparse graph of the free cells; an edge costs its length times the mean factor of its ends."""
+    rows, cols = free.shape
+    index = np.arange(rows * cols).reshape(rows, cols)
+    source, target, weight = [], [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = (slice(0, rows - down), slice(max(0, -right), cols - max(0, right)))
+        b = (slice(down, rows), slice(max(0, right), cols - max(0, -right)))
+        open_ = free[a] & free[b]
+        if down and right:  # both cells beside a diagonal must be free: no corner is cut
+            open_ &= free[a[0], b[1]] & free[b[0], a[1]]
+        source.append(index[a][open_])
+        target.append(index[b][open_])
+        weight.append(CELL * np.hypot(down, right) * 0.5 * (factor[a][open_] + factor[b][open_]))
+    s, t, w = np.concatenate(source), np.concatenate(target), np.concatenate(weight)
+    size = rows * cols
+    return csr_matrix((np.concatenate([w, w]), (np.concatenate([s, t]), np.concatenate([t, s]))), shape=(size, size))
