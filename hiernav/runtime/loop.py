@@ -1,0 +1,154 @@
+"""A loop at a fixed rate that keeps its phase, skips what it missed, and brakes on every way out."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import Enum
+from types import FrameType
+
+from hiernav.runtime.clock import Clock
+from hiernav.runtime.timing import Histogram
+
+BRAKE_ATTEMPTS = 3
+
+
+class LoopExit(Enum):
+    """Why a loop returned."""
+
+    DONE = "done"
+    INTERRUPTED = "interrupted"
+
+
+class Interrupted(KeyboardInterrupt):
+    """SIGINT or SIGTERM arrived while the loop ran."""
+
+
+class FixedRateLoop:
+    """Calls `tick(now)` at the absolute deadlines start + k * period of the injected clock.
+
+    A deadline that has passed when the previous tick ends is skipped and counted, never caught up in a burst, and
+    the deadlines after it stay where they were. `brake` is called once the loop is left, whether by return,
+    exception, KeyboardInterrupt or SIGTERM, and again (three times at most) if it raises.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        period: float,
+        tick: Callable[[float], bool],
+        brake: Callable[[], None],
+        handle_signals: bool = True,
+    ) -> None:
+        """
+        Args:
+            clock: where deadlines are measured.
+            period: [s].
+            tick: called with the time [s]; returns True when the loop is done.
+            brake: stops the robot.
+            handle_signals: turn SIGINT and SIGTERM into an interruption while the loop runs in the main thread.
+
+        Raises:
+            ValueError: `period` is not a finite positive number.
+        """
+        if not (math.isfinite(period) and period > 0.0):
+            raise ValueError(f"FixedRateLoop: period {period} s must be finite and positive")
+        self.clock = clock
+        self.period = period
+        self.lateness = Histogram()
+        self.ticks = 0
+        self.overruns = 0
+        """Deadlines that were skipped, in all."""
+        self.overruns_in_a_row = 0
+        """Ticks in a row that each missed at least one deadline."""
+        self._tick = tick
+        self._brake = brake
+        self._handle_signals = handle_signals
+        self._leaving = True
+        self._signalled = False
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Leave the loop after the present tick. May be called from any thread."""
+        self._stopped = True
+
+    def run(self) -> LoopExit:
+        """Run until `tick` returns True, `stop` is called, or a signal or exception arrives.
+
+        Raises:
+            Exception: whatever `tick` raises, after the brake; or what `brake` raised at its last attempt.
+        """
+        self._leaving, self._signalled, self._stopped = True, False, False
+        exit_reason = LoopExit.DONE
+        with self._signals():
+            # Two levels: a signal in the few instructions before `_leaving` is set still finds a `finally` around it.
+            try:
+                try:
+                    self._run()
+                except KeyboardInterrupt:
+                    exit_reason = LoopExit.INTERRUPTED
+                finally:
+                    self._leaving = True
+            finally:
+                self._brake_for_sure()
+        return LoopExit.INTERRUPTED if self._signalled else exit_reason
+
+    def _run(self) -> None:
+        self._leaving = False
+        if self._signalled:
+            raise Interrupted("before the first tick")
+        start = self.clock.now()
+        index = 0
+        while not self._stopped:
+            deadline = start + index * self.period
+            self.clock.sleep_until(deadline)
+            now = self.clock.now()
+            self.lateness.record(max(now - deadline, 0.0))
+            self.ticks += 1
+            if self._tick(now):
+                return
+            index = self._next_index(start, index)
+
+    def _next_index(self, start: float, index: int) -> int:
+        """Number of the first deadline that has not passed."""
+        now = self.clock.now()
+        following = index + 1
+        if now <= start + following * self.period:
+            self.overruns_in_a_row = 0
+            return following
+        following = max(following + 1, math.ceil((now - start) / self.period))
+        self.overruns += following - index - 1
+        self.overruns_in_a_row += 1
+        return following
+
+    def _brake_for_sure(self) -> None:
+        for attempt in range(BRAKE_ATTEMPTS):
+            try:
+                self._brake()
+                return
+            except BaseException:
+                if attempt == BRAKE_ATTEMPTS - 1:
+                    raise
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        if not self._handle_signals or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupt(number: int, _frame: FrameType | None) -> None:
+            # Outside of the ticks a signal is only noted: it must not cut the braking short.
+            self._signalled = True
+            if not self._leaving:
+                self._leaving = True
+                raise Interrupted(signal.Signals(number).name)
+
+        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)

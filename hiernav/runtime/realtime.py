@@ -1,0 +1,101 @@
+"""Asks the operating system for punctuality: best effort, reported item by item, never required."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+PR_SET_TIMERSLACK = 29
+MCL_CURRENT = 1
+MCL_FUTURE = 2
+CAP_IPC_LOCK = 14
+
+
+@dataclass(frozen=True)
+class RealtimeConfig:
+    """What to ask for. Whatever the system refuses is reported and done without."""
+
+    timer_slack_ns: int = 1
+    """Timers of this thread fire at most this late [ns]; the system's default is 50000. 0 leaves it alone."""
+    fifo_priority: int | None = 50
+    """SCHED_FIFO priority, 1 to 99; None stays with the normal scheduler."""
+    lock_memory: bool = True
+    """Keep all pages in memory (mlockall)."""
+    cpus: tuple[int, ...] | None = None
+    """CPUs this process may run on; None leaves the choice to the system."""
+    freeze_gc: bool = True
+    """Move everything allocated so far out of the garbage collector's sight."""
+
+
+def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:
+    """Apply the settings to this process and thread.
+
+    Returns:
+        One entry per setting: "granted", "granted: ...", "not asked" or "refused: why". Never raises.
+    """
+    config = config or RealtimeConfig()
+    return {
+        "timer_slack": _attempt(config.timer_slack_ns > 0, lambda: _set_timer_slack(config.timer_slack_ns)),
+        "sched_fifo": _attempt(config.fifo_priority is not None, lambda: _set_fifo(config.fifo_priority or 1)),
+        "mlockall": _attempt(config.lock_memory, _lock_memory),
+        "cpu_affinity": _attempt(config.cpus is not None, lambda: _set_affinity(config.cpus or ())),
+        "gc_freeze": _attempt(config.freeze_gc, _freeze_gc),
+    }
+
+
+def _attempt(asked: bool, action: Callable[[], str]) -> str:
+    if not asked:
+        return "not asked"
+    try:
+        detail = action()
+    except Exception as error:  # an unknown platform may lack any of these calls
+        return f"refused: {error}"
+    return f"granted: {detail}" if detail else "granted"
+
+
+def _set_timer_slack(nanoseconds: int) -> str:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(nanoseconds), 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return f"{nanoseconds} ns"
+
+
+def _set_fifo(priority: int) -> str:
+    # Children (the planner's process) start with the normal scheduler again.
+    policy = os.SCHED_FIFO | getattr(os, "SCHED_RESET_ON_FORK", 0)
+    os.sched_setscheduler(0, policy, os.sched_param(priority))
+    return f"priority {priority}"
+
+
+def _lock_memory() -> str:
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    unlimited = limit == resource.RLIM_INFINITY or _has_capability(CAP_IPC_LOCK)
+    # Under a finite limit, MCL_FUTURE would make a later allocation fail instead of this call.
+    flags = MCL_CURRENT | MCL_FUTURE if unlimited else MCL_CURRENT
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(flags) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return "present and future pages" if unlimited else "present pages"
+
+
+def _has_capability(bit: int) -> bool:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            return bool(int(line.split()[1], 16) >> bit & 1)
+    return False
+
+
+def _set_affinity(cpus: tuple[int, ...]) -> str:
+    os.sched_setaffinity(0, set(cpus))
+    return "CPU " + ", ".join(str(cpu) for cpu in sorted(os.sched_getaffinity(0)))
+
+
+def _freeze_gc() -> str:
+    gc.collect()
+    gc.freeze()
+    return f"{gc.get_freeze_count()} objects"

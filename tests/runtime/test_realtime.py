@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+SETTINGS = {"timer_slack", "sched_fifo", "mlockall", "cpu_affinity", "gc_freeze"}
+
+
+def in_a_process_of_its_own(program: str) -> dict[str, str]:
+    """Run `program`, which sets `report`, where its settings cannot disturb the other tests."""
+    head = "import json\nfrom hiernav.runtime.realtime import RealtimeConfig, request_realtime\n"
+    tail = "\nprint(json.dumps(report))"
+    done = subprocess.run([sys.executable, "-c", head + program + tail], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_every_setting_is_reported_as_granted_or_with_the_reason_why_not():
+    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(cpus=(0,)))")
+    assert set(report) == SETTINGS
+    assert all(text.startswith(("granted", "refused: ")) for text in report.values())
+    assert report["gc_freeze"].startswith("granted")
+
+
+def test_what_is_not_asked_for_is_left_alone():
+    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(0, None, False, None, False))")
+    assert report == dict.fromkeys(SETTINGS, "not asked")
+
+
+def test_nonsense_is_refused_by_the_system_and_never_raised():
+    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(fifo_priority=1000, cpus=(100000,)))")
+    assert report["sched_fifo"].startswith("refused: ")
+    assert report["cpu_affinity"].startswith("refused: ")
+
+
+def test_a_system_without_these_calls_is_no_error():
+    report = in_a_process_of_its_own(
+        "import ctypes, os\n"
+        "def missing(*_, **__): raise OSError('no libc here')\n"
+        "ctypes.CDLL = missing\n"
+        "del os.sched_setscheduler, os.sched_setaffinity\n"
+        "report = request_realtime(RealtimeConfig(cpus=(0,)))"
+    )
+    assert report["timer_slack"] == "refused: no libc here"
+    assert report["sched_fifo"].startswith("refused: ")
+    assert report["cpu_affinity"].startswith("refused: ")
