@@ -1,0 +1,186 @@
+"""Many simulations of one robot, stepped together.
+
+All simulations share one compiled model. Each control step is one `mj_step` call per simulation, over all substeps;
+MuJoCo releases the interpreter lock meanwhile, so that threads step their share of the rows side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+
+from hiernav.sim.robots import BASE_SENSORS, JointReader, RobotSpec
+from hiernav.sim.scene import CONTACT_SENSORS, ObstaclePool, SceneSpec, build_model
+from hiernav.sim.worlds import Layout
+
+STATE_LIMIT = 1e10
+"""Positions and velocities beyond this count as not finite, as in MuJoCo's own check."""
+
+
+class BatchSim:
+    """`num_envs` simulations of `robot` in scenes of one kind; row i of every array is simulation i.
+
+    Arrays published after each `reset` and `step`. They are new each time and never written again:
+        pose (N, 3): x, y [m] and yaw [rad] in [-pi, pi), world frame.
+        velocity (N, 2): of the body origin, world frame [m/s].
+        upright (N,): z component of the body's z axis, 1 when it stands.
+        collided (N,) bool: the robot touched an obstacle in any substep of the last control step.
+        sensors: name -> (N, d). accelerometer, velocimeter, gyro and magnetometer (3 each, body frame) and the robot's
+            `extra_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that
+            substep's start; everything else is of the present state.
+        time (N,): since the row's reset [s].
+        finite (N,) bool: False where the physics has diverged. Such a row stands still until it is reset.
+
+    Contacts are found at the start of a substep. A contact that begins with the end of the last substep is therefore
+    reported by the next control step.
+    """
+
+    pose: np.ndarray
+    velocity: np.ndarray
+    upright: np.ndarray
+    collided: np.ndarray
+    sensors: dict[str, np.ndarray]
+    time: np.ndarray
+    finite: np.ndarray
+    _qpos: np.ndarray
+    _qvel: np.ndarray
+    _readings: np.ndarray
+    _history: np.ndarray
+
+    def __init__(self, robot: RobotSpec, num_envs: int, scene: SceneSpec, threads: int = 1) -> None:
+        """Build the scene and put every robot at the origin, without obstacles.
+
+        `threads` is how many threads step the rows, the caller's included; it changes the speed and nothing else.
+        Raises ValueError if `num_envs` or `threads` is below 1.
+        """
+        for name, value in (("num_envs", num_envs), ("threads", threads)):
+            if value < 1:
+                raise ValueError(f"BatchSim: {name} is {value}, it must be at least 1")
+        self.robot = robot
+        self.num_envs = num_envs
+        self.scene = scene
+        self.model = build_model(robot, scene)
+        self._pool = ObstaclePool(scene)
+        self._joints = JointReader(robot, self.model)
+        self._datas = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        self._views = [(d.ctrl, d.qpos, d.qvel, d.sensordata, d.history) for d in self._datas]
+        self._gremlins: dict[int, Layout] = {}
+        self._sensor_columns = {
+            name: slice(self.model.sensor(name).adr[0], self.model.sensor(name).adr[0] + 3) for name in BASE_SENSORS
+        }
+        self._contact_columns = [_history_values(self.model, name) for name in CONTACT_SENSORS]
+        self._chunks = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(threads, num_envs))]
+        self._workers = ThreadPoolExecutor(len(self._chunks) - 1, "batch-sim") if len(self._chunks) > 1 else None
+        self._allocate()
+        self.collided = np.zeros(num_envs, bool)
+        for row, data in enumerate(self._datas):
+            mujoco.mj_forward(self.model, data)
+            self._gather(row)
+        self._publish()
+
+    def reset(self, rows: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """Put `rows` (M,) int at rest at the start of their `layouts` (M of them), at time 0; the others go on.
+
+        Nothing of the previous episode remains: controls, warm start and sensors are those of a fresh simulation.
+        Raises ValueError for a row that is out of range or given twice, and for a layout that does not fit the scene;
+        no row is changed then.
+        """
+        rows = np.atleast_1d(np.asarray(rows, dtype=int))
+        if len(rows) != len(layouts) or len(set(rows.tolist())) != len(rows):
+            raise ValueError(f"reset: {len(layouts)} layouts for rows {rows.tolist()}; one each, no row twice")
+        if len(rows) and not (0 <= rows.min() and rows.max() < self.num_envs):
+            raise ValueError(f"reset: rows {rows.tolist()} must lie in 0 to {self.num_envs - 1}")
+        for layout in layouts:
+            self._pool.check(layout)
+        self._qpos, self._qvel = self._qpos.copy(), self._qvel.copy()
+        self._readings, self._history = self._readings.copy(), self._history.copy()
+        self.time, self.collided = self.time.copy(), self.collided.copy()
+        for row, layout in zip(rows.tolist(), layouts, strict=True):
+            data = self._datas[row]
+            mujoco.mj_resetData(self.model, data)
+            self.robot.place(data.qpos, layout.start)
+            self._pool.arrange(layout, data.mocap_pos, data.mocap_quat)
+            mujoco.mj_forward(self.model, data)
+            self._gremlins.pop(row, None)
+            if len(layout.gremlins):
+                self._gremlins[row] = layout
+            self._gather(row)
+        self.collided[rows] = False
+        self._publish()
+
+    def step(self, actions: np.ndarray) -> None:
+        """One control step: `actions` (N, A), clipped to [-1, 1], are held for all substeps.
+
+        Gremlins stand during the step where they are at its start. Raises ValueError for actions of another shape or
+        that are not finite, naming the row; nothing is stepped then.
+        """
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != (self.num_envs, self.model.nu):
+            raise ValueError(f"step: actions have shape {actions.shape}, it must be {(self.num_envs, self.model.nu)}")
+        if not np.isfinite(actions).all():
+            row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+            raise ValueError(f"step: action of row {row} is not finite: {actions[row].tolist()}")
+        self._controls = np.clip(actions, -1.0, 1.0)
+        for row, layout in self._gremlins.items():
+            data = self._datas[row]
+            self._pool.move_gremlins(layout, data.time, data.mocap_pos)
+        self._allocate()
+        if self._workers is None:
+            self._step_rows(self._chunks[0])
+        else:
+            futures = [self._workers.submit(self._step_rows, chunk) for chunk in self._chunks[1:]]
+            self._step_rows(self._chunks[0])
+            for future in futures:
+                future.result()
+        total, floor, own = (self._history[:, columns] for columns in self._contact_columns)
+        self.collided = (total > floor + own).any(axis=1) & self.finite
+        self._publish()
+
+    def close(self) -> None:
+        """Stop the worker threads. The simulations cannot be stepped afterwards."""
+        if self._workers is not None:
+            self._workers.shutdown()
+
+    def _step_rows(self, rows: Sequence[int]) -> None:
+        model, substeps, controls, finite = self.model, self.robot.substeps, self._controls, self.finite
+        for row in rows:
+            if finite[row]:
+                self._views[row][0][:] = controls[row]
+                mujoco.mj_step(model, self._datas[row], nstep=substeps)
+            self._gather(row)
+
+    def _allocate(self) -> None:
+        n, model = self.num_envs, self.model
+        self._qpos, self._qvel = np.empty((n, model.nq)), np.empty((n, model.nv))
+        self._readings, self._history = np.empty((n, model.nsensordata)), np.empty((n, model.nhistory))
+        self.time = np.empty(n)
+
+    def _gather(self, row: int) -> None:
+        _, qpos, qvel, readings, history = self._views[row]
+        self._qpos[row] = qpos
+        self._qvel[row] = qvel
+        self._readings[row] = readings
+        self._history[row] = history
+        self.time[row] = self._datas[row].time
+
+    def _publish(self) -> None:
+        robot, qpos, qvel = self.robot, self._qpos, self._qvel
+        # comparisons with NaN are False
+        self.finite = (np.abs(qpos) < STATE_LIMIT).all(axis=1) & (np.abs(qvel) < STATE_LIMIT).all(axis=1)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            self.pose = robot.pose(qpos)
+            self.velocity = robot.velocity(qvel)
+            self.upright = robot.upright(qpos)
+            self.sensors = {name: self._readings[:, columns] for name, columns in self._sensor_columns.items()}
+            self.sensors |= self._joints.read(qpos, qvel)
+
+
+def _history_values(model: mujoco.MjModel, sensor: str) -> slice:
+    """Where the samples of a one-dimensional sensor lie in `MjData.history`: after two fields and their times."""
+    index = model.sensor(sensor).id
+    samples = int(model.sensor_history[index, 0])
+    start = int(model.sensor_historyadr[index]) + 2 + samples
+    return slice(start, start + samples)
