@@ -1,0 +1,74 @@
+"""Hierarchical navigation: a learned waypoint planner over a learned locomotion skill.
+
+The public names are imported when they are first used; importing `hiernav` itself loads nothing but this file.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
+    from hiernav.nav.observation import ObservationLayout
+    from hiernav.nav.occupancy import OccupancyMap, VisitMap
+    from hiernav.nav.option import HierarchicalAgent, Planner, ReplanRule, TerminationReason, WaypointOption
+    from hiernav.nav.search import PathField
+    from hiernav.sim.batch import BatchSim
+    from hiernav.sim.robots import get_robot
+    from hiernav.sim.worlds import parse_world, sample_layout
+
+_HOME = {
+    "ConfigError": "hiernav.config",
+    "TrainConfig": "hiernav.config",
+    "dump_config": "hiernav.config",
+    "load_config": "hiernav.config",
+    "ObservationLayout": "hiernav.nav.observation",
+    "OccupancyMap": "hiernav.nav.occupancy",
+    "VisitMap": "hiernav.nav.occupancy",
+    "HierarchicalAgent": "hiernav.nav.option",
+    "Planner": "hiernav.nav.option",
+    "ReplanRule": "hiernav.nav.option",
+    "TerminationReason": "hiernav.nav.option",
+    "WaypointOption": "hiernav.nav.option",
+    "PathField": "hiernav.nav.search",
+    "BatchSim": "hiernav.sim.batch",
+    "get_robot": "hiernav.sim.robots",
+    "parse_world": "hiernav.sim.worlds",
+    "sample_layout": "hiernav.sim.worlds",
+}
+
+__all__ = [
+    "BatchSim",
+    "ConfigError",
+    "HierarchicalAgent",
+    "ObservationLayout",
+    "OccupancyMap",
+    "PathField",
+    "Planner",
+    "ReplanRule",
+    "TerminationReason",
+    "TrainConfig",
+    "VisitMap",
+    "WaypointOption",
+    "__version__",
+    "dump_config",
+    "get_robot",
+    "load_config",
+    "parse_world",
+    "sample_layout",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'hiernav' has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

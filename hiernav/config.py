@@ -1,0 +1,256 @@
+"""Every setting of training, typed, frozen and checked; one line per setting.
+
+The defaults of a field are those of the preset `default`. Another preset is a set of values that differ from them
+(`PRESETS`); a YAML file overrides the preset, and `key.path=value` texts from the command line override the file.
+What a trained network depends on is written into its bundle at export: the runtime reads no file of this kind.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from hiernav.decode import ConfigError, FieldHelp, decode, describe, dump_yaml, parse_yaml, unknown_key
+
+__all__ = [
+    "ConfigError", "OptionConfig", "PlannerConfig", "RewardConfig", "SkillConfig", "TrainConfig",
+    "check_config", "describe_config", "dump_config", "load_config",
+]  # fmt: skip
+
+_WORLD_PATTERN = r"^(pillar\([^()]+\)|(gremlin|two-room|four-room)(\([^()]+\))?|map\(.+\)|.+\.ya?ml)$"
+_WORLD_HELP = "a world: pillar(2,2,10), gremlin, two-room, four-room, map(file.yaml)"
+World = Annotated[str, Meta(pattern=_WORLD_PATTERN, extra={"accepts": _WORLD_HELP})]
+Width = Annotated[int, Meta(ge=1, le=8192)]
+
+
+class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The waypoint generator: its data set, its network and its training (method sections 4 and 5)."""
+
+    preset: Annotated[Literal["default", "paper"], Meta(description="`paper`: the published network.")] = "default"
+    samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 100_000
+    samples_per_world: Annotated[int, Meta(ge=1, description="Starts labelled by one shortest-path field.")] = 100
+    epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 20
+    batch_size: Annotated[int, Meta(ge=1, description="Samples per update.")] = 256
+    learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimiser.")] = 1e-3
+    weight_decay: Annotated[float, Meta(ge=0, le=1, description="Decoupled weight decay of the optimiser.")] = 1e-4
+    hypotheses: Annotated[int, Meta(ge=1, le=16, description="Plans proposed at once; the best one learns.")] = 4
+    clearance_weight: Annotated[float, Meta(ge=0, description="Weight of the penalty on waypoints near obstacles.")] = (
+        1.0
+    )
+    mirror: Annotated[bool, Meta(description="Double the data by reflection left to right.")] = True
+    planning_radius_m: Annotated[
+        Annotated[float, Meta(gt=0, le=10)] | None,
+        Meta(description="Disc that labels keep free [m]; null: the robot's own."),
+    ] = None
+    soft_margin_m: Annotated[
+        float, Meta(ge=0, le=10, description="Further clearance worth a detour in labels [m].")
+    ] = 0.15
+    worlds: Annotated[
+        tuple[World, ...], Meta(min_length=1, description="Worlds the samples are drawn from, in equal parts.")
+    ] = ("pillar(2,2,10)",)
+    minutes: Annotated[
+        Annotated[float, Meta(gt=0)] | None, Meta(description="Time limit of training [min]; null: none.")
+    ] = None
+
+
+class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The low-level skill and its soft actor-critic training (method section 8)."""
+
+    preset: Annotated[
+        Literal["default", "paper", "baseline"],
+        Meta(description="`baseline`: no waypoints, the goal instead. Also the preset of `option` and `reward`."),
+    ] = "default"
+    world: Annotated[World, Meta(description="World to train in.")] = "pillar(2,2,10)"
+    planner: Annotated[
+        Literal["astar", "cnn"], Meta(description="Who plans in training: exact search or the trained network.")
+    ] = "astar"
+    num_envs: Annotated[int, Meta(ge=1, le=65_536, description="Simulations stepped together.")] = 16
+    total_steps: Annotated[int, Meta(ge=1, description="Control steps in all, summed over simulations.")] = 1_000_000
+    learning_starts: Annotated[int, Meta(ge=0, description="Steps with random actions before the first update.")] = (
+        10_000
+    )
+    updates_per_step: Annotated[float, Meta(gt=0, le=64, description="Gradient updates per control step.")] = 1.0
+    batch_size: Annotated[int, Meta(ge=1, description="Transitions per update.")] = 256
+    buffer_size: Annotated[int, Meta(ge=1, description="Transitions kept for replay.")] = 1_000_000
+    hidden: Annotated[tuple[Width, ...], Meta(min_length=1, description="Widths of the hidden layers.")] = (256, 256)
+    discount: Annotated[float, Meta(ge=0, lt=1, description="Discount per control step.")] = 0.99
+    tau: Annotated[float, Meta(gt=0, le=1, description="Rate at which target critics follow.")] = 0.005
+    learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimisers.")] = 3e-4
+    alpha_floor: Annotated[float, Meta(ge=0, description="The temperature does not fall below this.")] = 0.005
+    init_alpha: Annotated[float, Meta(gt=0, description="Temperature at the start.")] = 1.0
+    target_entropy: Annotated[
+        float | None, Meta(description="Entropy the temperature aims at [nat]; null: -actions.")
+    ] = None
+    reward_scale: Annotated[float, Meta(gt=0, description="Factor on the reward that the critics learn from.")] = 1.0
+    eval_every_steps: Annotated[int, Meta(ge=1, description="Steps between evaluations.")] = 50_000
+    eval_episodes: Annotated[int, Meta(ge=1, description="Episodes per evaluation.")] = 50
+    checkpoint_every_steps: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 50_000
+    stop_reach_rate: Annotated[
+        Annotated[float, Meta(gt=0, le=1)] | None,
+        Meta(description="Stop once an evaluation reaches this rate; null: never."),
+    ] = None
+    compile: Annotated[bool, Meta(description="Compile the update with torch.compile.")] = False
+
+
+class OptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a plan ends and what a plan is (method section 6)."""
+
+    d_update_m: Annotated[float, Meta(gt=0, description="Replan farther than this from the closest waypoint [m].")] = (
+        0.3
+    )
+    half_fraction: Annotated[float, Meta(gt=0, le=1, description="Replan once this part of the plan is used up.")] = 0.5
+    invalid: Annotated[bool, Meta(description="Replan when the rest of the plan meets the current map.")] = True
+    period: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(description="Replan every so many steps instead of by rule; null: by rule."),
+    ] = None
+    waypoints: Annotated[int, Meta(ge=2, le=100, description="Waypoints of a plan.")] = 10
+    spacing_m: Annotated[float, Meta(gt=0, le=10, description="Distance between waypoints [m].")] = 0.1
+
+
+class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Weights of the named reward terms (method section 7)."""
+
+    preset: Annotated[
+        Literal["default", "paper", "baseline"],
+        Meta(description="How progress is measured; as `skill.preset` if left out."),
+    ] = "default"
+    path_distance: Annotated[float, Meta(description="Per metre of distance from the plan.")] = -0.1
+    progress: Annotated[float, Meta(description="Per `division_m` of progress along the plan.")] = 0.5
+    collision: Annotated[float, Meta(description="Per control step with any contact with an obstacle.")] = -1.0
+    goal: Annotated[float, Meta(description="Once, on reaching the goal.")] = 1.0
+    leave_field: Annotated[float, Meta(description="Once, on leaving the field.")] = 0.0
+    goal_distance: Annotated[float, Meta(description="Per metre of distance to the goal, every step.")] = 0.0
+    division_m: Annotated[
+        float, Meta(gt=0, le=1, description="Spacing of the points that plan and motion are divided in [m].")
+    ] = 0.1
+
+
+class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One training run."""
+
+    robot: Annotated[Literal["point", "car", "doggo"], Meta(description="Robot to train.")] = "point"
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1, description="The one seed of the run.")] = 0
+    run_dir: Annotated[
+        Annotated[str, Meta(min_length=1)] | None, Meta(description="Output folder; null: a new one in runs/.")
+    ] = None
+    threads: Annotated[int, Meta(ge=1, le=1024, description="Threads that step simulations.")] = 1
+    planner: PlannerConfig = PlannerConfig()
+    skill: SkillConfig = SkillConfig()
+    option: OptionConfig = OptionConfig()
+    reward: RewardConfig = RewardConfig()
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "planner": {
+        "paper": {"weight_decay": 0.0, "hypotheses": 1, "clearance_weight": 0.0, "mirror": False, "soft_margin_m": 0.0},
+    },
+    "skill": {
+        "paper": {"planner": "cnn", "num_envs": 1, "alpha_floor": 0.0},
+        "baseline": {"num_envs": 1, "alpha_floor": 0.0},
+    },
+    "option": {"paper": {"invalid": False}},
+    "reward": {"baseline": {"path_distance": 0.0, "progress": 0.0, "goal_distance": -1.0}},
+}
+"""Section -> preset -> the values that differ from the field defaults."""
+
+
+def load_config(path: str | Path | None = None, overrides: list[str] | None = None) -> TrainConfig:
+    """Read a configuration: preset, then file, then `key.path=value` overrides.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting in it cannot be used; see `hiernav.decode`.
+    """
+    name = "defaults" if path is None else str(path)
+    values = {} if path is None else _read(Path(path))
+    from_command_line: set[str] = set()
+    known = [field.path for field in describe_config()]
+    for override in overrides or []:
+        key, equals, text = override.partition("=")
+        if not equals:
+            raise ConfigError(f"command line: {override!r}, expected key.path=value")
+        if key not in known:
+            raise ConfigError(f"command line: {unknown_key(key, known)}")
+        section, _, leaf = key.rpartition(".")
+        target = values.setdefault(section, {}) if section else values
+        if isinstance(target, dict):  # else decode() reports the section
+            target[leaf] = parse_yaml(text, f"command line: {key}")
+        from_command_line.add(key)
+
+    def source(key: str) -> str:
+        return "command line" if key in from_command_line else name
+
+    return check_config(decode(TrainConfig, _apply_presets(values), source), name)
+
+
+def dump_config(config: TrainConfig) -> str:
+    """YAML with every value spelled out; `load_config` reads it back equal, whatever the presets become."""
+    return dump_yaml(msgspec.to_builtins(config))
+
+
+def describe_config() -> list[FieldHelp]:
+    """Every setting with its type, default and description, for `--help`."""
+    return describe(TrainConfig)
+
+
+def check_config(config: TrainConfig, source: str = "configuration") -> TrainConfig:
+    """Check a configuration that was built in Python, and the rules between settings; returns it.
+
+    Raises:
+        ConfigError: names the settings, their values and the limit.
+    """
+    decode(TrainConfig, msgspec.to_builtins(config), source)
+    skill, reward = config.skill, config.reward
+    if skill.batch_size > skill.buffer_size:
+        raise ConfigError(
+            f"{source}: skill.batch_size = {skill.batch_size}, expected <= skill.buffer_size = {skill.buffer_size}"
+        )
+    if skill.learning_starts >= skill.total_steps:
+        raise ConfigError(
+            f"{source}: skill.learning_starts = {skill.learning_starts}, "
+            f"expected < skill.total_steps = {skill.total_steps}"
+        )
+    if skill.preset == "baseline" and (reward.path_distance or reward.progress):
+        raise ConfigError(
+            f"{source}: reward.path_distance = {reward.path_distance} and reward.progress = {reward.progress}, "
+            "expected 0: skill.preset = 'baseline' follows no plan"
+        )
+    return config
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    values = parse_yaml(text, str(path))
+    if not isinstance(values, dict | None):
+        raise ConfigError(f"{path}: expected a mapping of settings, got {type(values).__name__}")
+    # A section whose lines are all commented out reads as null.
+    return {key: {} if value is None and key in PRESETS else value for key, value in (values or {}).items()}
+
+
+def _apply_presets(values: dict[str, Any]) -> dict[str, Any]:
+    """Lay the given values over those of the presets they name. Values of a wrong type are left for `decode`."""
+
+    def preset_of(section: str) -> Any:
+        given = values.get(section)
+        return given.get("preset") if isinstance(given, dict) else None
+
+    merged = dict(values)
+    for section, presets in PRESETS.items():
+        own = preset_of(section)
+        preset = own if own is not None else preset_of("skill") if section in ("option", "reward") else None
+        given = values.get(section, {})
+        if not isinstance(preset, str) or not isinstance(given, dict):
+            continue
+        base = dict(presets.get(preset, {}))
+        if section == "reward":
+            base["preset"] = preset
+        merged[section] = base | given
+    return merged

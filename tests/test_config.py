@@ -1,0 +1,323 @@
+"""Claims about settings: what is accepted is what is written, and what is wrong is named."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hiernav.config import (
+    PRESETS,
+    ConfigError,
+    OptionConfig,
+    PlannerConfig,
+    RewardConfig,
+    SkillConfig,
+    TrainConfig,
+    check_config,
+    describe_config,
+    dump_config,
+    load_config,
+)
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+SECTIONS = {"planner": PlannerConfig, "skill": SkillConfig, "option": OptionConfig, "reward": RewardConfig}
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "robot.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def error_of(path: Path | None, *overrides: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, list(overrides))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def load_text(folder: Path, text: str) -> TrainConfig:
+    return load_config(write(folder, text))
+
+
+def test_without_a_file_every_setting_is_the_default() -> None:
+    assert load_config() == TrainConfig()
+
+
+def test_the_command_line_overrides_the_file_and_the_file_overrides_the_preset(tmp_path: Path) -> None:
+    path = write(tmp_path, "skill: {preset: paper, num_envs: 4, tau: 0.01}\n")
+    skill = load_config(path, ["skill.tau=0.02", "robot=doggo"]).skill
+    assert (skill.alpha_floor, skill.num_envs, skill.tau) == (0.0, 4, 0.02)
+    assert load_config(path, ["robot=doggo"]).robot == "doggo"
+
+
+def test_a_preset_can_be_chosen_on_the_command_line(tmp_path: Path) -> None:
+    path = write(tmp_path, "planner: {epochs: 3}\n")
+    planner = load_config(path, ["planner.preset=paper"]).planner
+    assert (planner.hypotheses, planner.mirror, planner.epochs) == (1, False, 3)
+
+
+def test_option_and_reward_follow_the_preset_of_the_skill() -> None:
+    paper = load_config(overrides=["skill.preset=paper"])
+    assert not paper.option.invalid
+    assert paper.reward.preset == "paper"
+    baseline = load_config(overrides=["skill.preset=baseline"])
+    assert baseline.reward == RewardConfig(preset="baseline", path_distance=0.0, progress=0.0, goal_distance=-1.0)
+    assert load_config(overrides=["skill.preset=paper", "reward.preset=default"]).reward == RewardConfig()
+
+
+def test_the_paper_preset_has_the_published_values() -> None:
+    config = load_config(overrides=["skill.preset=paper", "planner.preset=paper"])
+    skill, reward, option = config.skill, config.reward, config.option
+    assert skill.hidden == (256, 256)
+    assert (skill.learning_rate, skill.discount, skill.tau) == (3e-4, 0.99, 0.005)
+    assert (skill.buffer_size, skill.batch_size, skill.updates_per_step) == (1_000_000, 256, 1.0)
+    assert (reward.path_distance, reward.progress, reward.collision, reward.goal) == (-0.1, 0.5, -1.0, 1.0)
+    assert (option.d_update_m, option.half_fraction, option.waypoints, option.spacing_m) == (0.3, 0.5, 10, 0.1)
+    assert config.planner.worlds == ("pillar(2,2,10)",)
+
+
+@pytest.mark.parametrize("section", PRESETS)
+def test_a_preset_states_only_what_differs_from_the_default(section: str) -> None:
+    default = msgspec.to_builtins(SECTIONS[section]())
+    for preset, values in PRESETS[section].items():
+        assert values.keys() <= default.keys()
+        assert not {key for key, value in values.items() if value == default[key]}, preset
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
+def test_a_shipped_file_loads_and_states_only_what_differs_from_the_default(path: Path) -> None:
+    config = load_config(path)
+    for line in path.read_text().splitlines():
+        if line.startswith("  ") and not line.strip().startswith("#"):
+            key = line.split(":")[0].strip()
+            values = [
+                (getattr(getattr(config, name), key, None), getattr(kind(), key, None))
+                for name, kind in SECTIONS.items()
+            ]
+            assert any(value != default for value, default in values), line
+
+
+def test_exponents_without_a_point_are_numbers(tmp_path: Path) -> None:
+    config = load_text(tmp_path, "skill:\n  learning_rate: 3e-4\n  total_steps: 2_000_000\n")
+    assert (config.skill.learning_rate, config.skill.total_steps) == (3e-4, 2_000_000)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "skill:\n", "---\n"])
+def test_an_empty_file_or_section_changes_nothing(tmp_path: Path, text: str) -> None:
+    assert load_text(tmp_path, text) == TrainConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("skill: {num_envs: 0}", ["skill.num_envs", "= 0", ">= 1"]),
+        ("skill: {num_envs: 100_000}", ["skill.num_envs", "100000", "<= 65536"]),
+        ("skill: {num_envs: 2.0}", ["skill.num_envs", "2.0", "int"]),
+        ("skill: {num_envs: true}", ["skill.num_envs", "True", "int"]),
+        ("skill: {num_envs: '8'}", ["skill.num_envs", "'8'", "int"]),
+        ("skill: {num_envs: 010}", ["skill.num_envs", "'010'", "int"]),
+        ("skill: {num_envs: }", ["skill.num_envs", "None", "int"]),
+        ("skill: {compile: on}", ["skill.compile", "'on'", "true | false"]),
+        ("skill: {discount: 1.0}", ["skill.discount", "1.0", "< 1"]),
+        ("skill: {hidden: []}", ["skill.hidden", "[]", "at least 1"]),
+        ("skill: {hidden: [256, 0]}", ["skill.hidden", "[256, 0]", "int >= 1"]),
+        ("skill: {stop_reach_rate: 1.5}", ["skill.stop_reach_rate", "1.5", "null or float > 0 and <= 1"]),
+        ("skill: {world: maze}", ["skill.world", "'maze'", "pillar(2,2,10)"]),
+        ("planner: {worlds: [gremlin, maze]}", ["planner.worlds", "maze", "pillar(2,2,10)"]),
+        ("planner: {preset: baseline}", ["planner.preset", "'baseline'", "default | paper"]),
+        ("skill: {preset: [paper]}", ["skill.preset", "['paper']", "baseline | default | paper"]),
+        ("reward: {goal: .nan}", ["reward.goal", "nan", "finite"]),
+        ("reward: {goal: -.inf}", ["reward.goal", "-inf", "finite"]),
+        ("reward: {goal: 2024-01-01}", ["reward.goal", "'2024-01-01'", "float"]),
+        ("seed: -1", ["seed", "-1", ">= 0"]),
+        ("seed: 99999999999999999999999", ["seed", "99999999999999999999999"]),
+        ("robot: ant", ["robot", "'ant'", "car | doggo | point"]),
+        ("skill: 3", ["skill = 3", "mapping"]),
+        ("skill: [1]", ["skill = [1]", "mapping"]),
+        ("[1, 2]", ["mapping", "list"]),
+        ("just text", ["mapping", "str"]),
+    ],
+)
+def test_a_wrong_value_is_refused_with_file_key_value_and_limit(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = write(tmp_path, text)
+    message = error_of(path)
+    for part in [str(path), *parts]:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "nearest"),
+    [
+        ("skill: {num_env: 3}", "skill.num_env", "skill.num_envs"),
+        ("sklil: {}", "sklil", "skill"),
+        ("num_envs: 3", "num_envs", "skill.num_envs"),
+        ("planner: {learning_rte: 1}", "planner.learning_rte", "planner.learning_rate"),
+        ("skill.num_envs: 3", "skill.num_envs", None),
+        ("1: 2", "1", None),
+        ("skill: {<<: {tau: 0.1}}", "skill.<<", None),
+    ],
+)
+def test_an_unknown_key_is_refused_and_the_nearest_is_named(
+    tmp_path: Path, text: str, key: str, nearest: str | None
+) -> None:
+    path = write(tmp_path, text)
+    message = error_of(path)
+    assert str(path) in message
+    assert key in message
+    assert (f"did you mean '{nearest}'" in message) == (nearest is not None)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "word"),
+    [
+        ("seed: 1\nskill: {tau: 0.1\n", 3, "expected"),
+        ("seed: 1\n\tskill: 2\n", 2, "'\\t'"),
+        ("seed: 1\nrobot: car\nseed: 2\n", 3, "repeated key 'seed'"),
+        ("skill:\n  tau: 0.1\n  tau: 0.1\n", 3, "repeated key 'tau'"),
+        ("seed: 1\nrun_dir: \x07\n", 2, "characters"),
+        ("seed: 1\nrobot: !!python/name:os.system\n", 2, "constructor"),
+        ("seed: 1\n? [a]\n: 2\n", 2, "unhashable"),
+        ("seed: *other\n", 1, "undefined alias"),
+        ("seed: 1\n---\nseed: 2\n", 2, "document"),
+    ],
+)
+def test_malformed_yaml_is_refused_with_file_and_line(tmp_path: Path, text: str, line: int, word: str) -> None:
+    path = write(tmp_path, text)
+    message = error_of(path)
+    assert message.startswith(f"{path}:{line}: malformed YAML")
+    assert word in message
+
+
+def test_a_file_nested_too_deeply_is_refused(tmp_path: Path) -> None:
+    assert "nested too deeply" in error_of(write(tmp_path, "seed: " + "[" * 3000 + "]" * 3000))
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    assert "No such file" in error_of(tmp_path / "absent.yaml")
+    (tmp_path / "latin.yaml").write_bytes(b"run_dir: caf\xe9\n")
+    assert "not UTF-8" in error_of(tmp_path / "latin.yaml")
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("skill.num_envs=0", ["skill.num_envs = 0", ">= 1"]),
+        ("skill.num_env=3", ["'skill.num_env'", "did you mean 'skill.num_envs'"]),
+        ("skill=3", ["unknown key 'skill'"]),
+        ("seed", ["'seed'", "key.path=value"]),
+        ("=3", ["unknown key ''"]),
+        ("skill.tau=[", ["skill.tau", "malformed YAML"]),
+        ("skill.tau=", ["skill.tau = None", "float"]),
+    ],
+)
+def test_a_wrong_override_is_refused_and_not_blamed_on_the_file(
+    tmp_path: Path, override: str, parts: list[str]
+) -> None:
+    message = error_of(write(tmp_path, "seed: 1\n"), override)
+    assert message.startswith("command line")
+    assert "robot.yaml" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_an_override_into_a_section_of_a_wrong_type_blames_the_file(tmp_path: Path) -> None:
+    assert "robot.yaml: skill = 3" in error_of(write(tmp_path, "skill: 3\n"), "skill.tau=0.1")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "parts"),
+    [
+        (["skill.buffer_size=100"], ["skill.batch_size = 256", "skill.buffer_size = 100"]),
+        (["skill.total_steps=1000"], ["skill.learning_starts = 10000", "skill.total_steps = 1000"]),
+        (["skill.preset=baseline", "reward.preset=default"], ["reward.path_distance", "baseline"]),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(overrides: list[str], parts: list[str]) -> None:
+    message = error_of(None, *overrides)
+    for part in parts:
+        assert part in message
+
+
+def test_a_configuration_built_in_python_is_checked_too() -> None:
+    config = TrainConfig(skill=SkillConfig(num_envs=0))
+    with pytest.raises(ConfigError, match=r"skill\.num_envs = 0, expected int >= 1"):
+        check_config(config)
+    assert check_config(TrainConfig()) == TrainConfig()
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        TrainConfig().skill.tau = 0.5  # type: ignore[misc]
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+unit = st.floats(0, 1, exclude_min=True)
+
+
+@st.composite
+def configs(draw: st.DrawFn) -> TrainConfig:
+    reward: dict[str, Any] = {
+        name: draw(finite) for name in ("path_distance", "progress", "collision", "goal", "goal_distance")
+    }
+    return TrainConfig(
+        robot=draw(st.sampled_from(["point", "car", "doggo"])),
+        seed=draw(st.integers(0, 2**63 - 1)),
+        run_dir=draw(
+            st.none() | st.text(min_size=1) | st.sampled_from(["null", "true", "1e3", "-", "2024", "a: b", "<<", "#"])
+        ),
+        planner=PlannerConfig(
+            preset=draw(st.sampled_from(["default", "paper"])),
+            worlds=tuple(draw(st.lists(st.sampled_from(["pillar(2,2,10)", "gremlin", "map(a b.yaml)"]), min_size=1))),
+            minutes=draw(st.none() | unit),
+            mirror=draw(st.booleans()),
+        ),
+        skill=SkillConfig(
+            preset=draw(st.sampled_from(["default", "paper"])),
+            hidden=tuple(draw(st.lists(st.integers(1, 512), min_size=1, max_size=4))),
+            tau=draw(unit),
+            target_entropy=draw(st.none() | finite),
+        ),
+        option=OptionConfig(invalid=draw(st.booleans()), period=draw(st.none() | st.integers(1, 1000))),
+        reward=RewardConfig(preset=draw(st.sampled_from(["default", "paper", "baseline"])), **reward),
+    )
+
+
+@given(configs())
+def test_a_written_configuration_reads_back_equal(
+    tmp_path_factory: pytest.TempPathFactory, config: TrainConfig
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
+    path.write_text(dump_config(config), encoding="utf-8", newline="")
+    assert load_config(path) == config
+
+
+@given(st.text(alphabet=st.sampled_from("seedkil:num_vs-[]{}&*!|>'\"#%@`,.?~10 \n\t"), max_size=60))
+def test_any_text_is_a_configuration_or_a_config_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(text, encoding="utf-8", newline="")
+    try:
+        assert isinstance(load_config(path), TrainConfig)
+    except ConfigError as error:
+        assert str(path) in str(error)
+
+
+def test_help_describes_every_setting_with_its_type_and_default() -> None:
+    described = {field.path: field for field in describe_config()}
+    values = msgspec.to_builtins(TrainConfig())
+    leaves = {key for key in values if key not in SECTIONS} | {f"{s}.{key}" for s in SECTIONS for key in values[s]}
+    assert described.keys() == leaves
+    assert all(field.description for field in described.values())
+    assert described["skill.num_envs"].type == "int >= 1 and <= 65536"
+    assert described["skill.num_envs"].default == SkillConfig().num_envs
+    assert described["robot"].type == "car | doggo | point"
+    assert described["skill.stop_reach_rate"].type == "null or float > 0 and <= 1"
+    assert described["planner.worlds"].type.startswith("list of at least 1 of: a world")
+    assert math.isclose(described["option.d_update_m"].default, 0.3)

@@ -1,0 +1,149 @@
+"""Who may import whom: the rooms of the library, read off every file, and torch kept out of what runs on a robot."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hiernav
+
+PACKAGE = Path(hiernav.__file__).parent
+# Room -> the rooms it may import. A room is a folder or a file directly under hiernav/.
+ALLOWED = {
+    "__init__": {"config", "nav", "sim"},
+    "decode": set(),
+    "config": {"decode"},
+    "nav": set(),
+    "sim": {"nav"},
+    "planner": {"nav", "sim", "config"},
+    "skill": {"nav", "sim", "config"},
+    "runtime": {"nav", "config", "decode"},
+    "evaluate": {"nav", "sim", "planner", "skill", "config"},
+    "export": {"nav", "sim", "planner", "skill", "evaluate", "config"},
+    "report": {"nav", "sim", "evaluate", "config"},
+    "cli": {"nav", "sim", "planner", "skill", "runtime", "evaluate", "export", "report", "config", "decode"},
+}
+EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
+TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}
+FORBIDDEN_PACKAGES = {
+    "nav": TRAINING_PACKAGES | {"mujoco", "onnxruntime"},
+    "sim": TRAINING_PACKAGES,
+    "runtime": TRAINING_PACKAGES,
+    "config": TRAINING_PACKAGES,
+    "decode": TRAINING_PACKAGES,
+    "__init__": TRAINING_PACKAGES,
+    "planner": {"torchrl", "tensordict"},
+}
+FILES = sorted(PACKAGE.rglob("*.py"))
+TORCH_FREE = sorted(f for f in FILES if f.relative_to(PACKAGE).parts[0] in ("nav", "sim", "runtime"))
+
+
+def imported_modules(source: str) -> set[str]:
+    """Dotted names of all modules a file may import, those inside functions included."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def forbidden_imports(relative: str, source: str) -> set[str]:
+    """Imports that the file at `relative` (under hiernav/) must not make."""
+    room = relative.partition("/")[0].removesuffix(".py")
+    assert room in ALLOWED, f"hiernav/{relative}: {room!r} is not a room of this library; add it to ALLOWED"
+    allowed = ALLOWED[room] | EXTRA_ALLOWED.get(relative, set()) | {room}
+    bad = set()
+    for module in imported_modules(source):
+        package, _, rest = module.partition(".")
+        if package == "hiernav":
+            if (target := rest.partition(".")[0]) in ALLOWED and target not in allowed:
+                bad.add(module)
+        elif package in FORBIDDEN_PACKAGES.get(room, set()):
+            bad.add(module)
+    return bad
+
+
+def module_name(file: Path) -> str:
+    parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.relative_to(PACKAGE).as_posix())
+def test_a_room_imports_only_what_it_may(file: Path) -> None:
+    relative = file.relative_to(PACKAGE).as_posix()
+    assert not forbidden_imports(relative, file.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    ("relative", "source"),
+    [
+        ("nav/path.py", "import hiernav.sim.batch"),
+        ("nav/path.py", "def f():\n    from mujoco import MjModel"),
+        ("nav/path.py", "from hiernav import sim"),
+        ("sim/batch.py", "import torch.nn as nn"),
+        ("planner/train.py", "from hiernav.skill.env import Env"),
+        ("skill/env.py", "from hiernav.planner import network"),
+        ("runtime/loop.py", "from hiernav.sim.batch import BatchSim"),
+        ("runtime/sim_robot.py", "from hiernav.planner import network"),
+        ("evaluate.py", "import hiernav.cli"),
+    ],
+)
+def test_a_wrong_import_is_found(relative: str, source: str) -> None:
+    assert len(forbidden_imports(relative, source)) == 1
+
+
+def test_only_the_simulated_robot_of_the_runtime_may_use_the_simulator() -> None:
+    assert not forbidden_imports("runtime/sim_robot.py", "from hiernav.sim.batch import BatchSim")
+
+
+def test_what_runs_on_a_robot_imports_without_torch() -> None:
+    """In a process where importing torch fails, every module of nav, sim and runtime can be imported."""
+    modules = [module_name(file) for file in TORCH_FREE] + ["hiernav", "hiernav.config"]
+    assert len(modules) > 5
+    code = f"""
+import importlib, sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {sorted(TRAINING_PACKAGES)!r}:
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Absent())
+for name in {modules!r}:
+    importlib.import_module(name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_deployed_scripts_name_no_training_package() -> None:
+    for file in (PACKAGE.parent / "deploy").rglob("*.py"):
+        packages = {module.partition(".")[0] for module in imported_modules(file.read_text(encoding="utf-8"))}
+        assert not packages & TRAINING_PACKAGES, file
+
+
+def test_importing_hiernav_loads_nothing_else() -> None:
+    code = (
+        "import sys, hiernav\n"
+        "print(*sorted(set(sys.modules) & {'numpy', 'mujoco', 'msgspec', 'torch', 'hiernav.nav', 'hiernav.config'}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == ""
+
+
+@pytest.mark.parametrize("name", sorted(set(hiernav.__all__) - {"__version__"}))
+def test_a_public_name_is_where_it_says(name: str) -> None:
+    assert getattr(hiernav, name).__name__ == name
+    assert name in dir(hiernav)
+
+
+def test_an_unknown_public_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        hiernav.nothing  # noqa: B018
