@@ -21,7 +21,7 @@ ALLOWED = {
     "sim": {"nav"},
     "planner": {"nav", "sim", "config"},
     "skill": {"nav", "sim", "config"},
-    "runtime": {"nav", "config", "decode"},
+    "runtime": {"nav", "decode"},
     "evaluate": {"nav", "sim", "planner", "skill", "config"},
     "export": {"nav", "sim", "planner", "skill", "evaluate", "config"},
     "report": {"nav", "sim", "evaluate", "config"},
