@@ -32,7 +32,7 @@ class BatchSim:
             `extra_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that
             substep's start; everything else is of the present state.
         time (N,): since the row's reset [s].
-        finite (N,) bool: False where the physics has diverged. Such a row stands still until it is reset.
+        finite (N,) bool: False where the physics has diverged. Such a row reads NaN and stands still until it is reset.
 
     Contacts are found at the start of a substep. A contact that begins with the end of the last substep is therefore
     reported by the next control step.
@@ -45,10 +45,6 @@ class BatchSim:
     sensors: dict[str, np.ndarray]
     time: np.ndarray
     finite: np.ndarray
-    _qpos: np.ndarray
-    _qvel: np.ndarray
-    _readings: np.ndarray
-    _history: np.ndarray
 
     def __init__(self, robot: RobotSpec, num_envs: int, scene: SceneSpec, threads: int = 1) -> None:
         """Build the scene and put every robot at the origin, without obstacles.
@@ -76,9 +72,9 @@ class BatchSim:
         self._workers = ThreadPoolExecutor(len(self._chunks) - 1, "batch-sim") if len(self._chunks) > 1 else None
         self._allocate()
         self.collided = np.zeros(num_envs, bool)
-        for row, data in enumerate(self._datas):
+        for data in self._datas:
             mujoco.mj_forward(self.model, data)
-            self._gather(row)
+        self._gather(range(num_envs))
         self._publish()
 
     def reset(self, rows: np.ndarray, layouts: Sequence[Layout]) -> None:
@@ -95,9 +91,6 @@ class BatchSim:
             raise ValueError(f"reset: rows {rows.tolist()} must lie in 0 to {self.num_envs - 1}")
         for layout in layouts:
             self._pool.check(layout)
-        self._qpos, self._qvel = self._qpos.copy(), self._qvel.copy()
-        self._readings, self._history = self._readings.copy(), self._history.copy()
-        self.time, self.collided = self.time.copy(), self.collided.copy()
         for row, layout in zip(rows.tolist(), layouts, strict=True):
             data = self._datas[row]
             mujoco.mj_resetData(self.model, data)
@@ -107,7 +100,9 @@ class BatchSim:
             self._gremlins.pop(row, None)
             if len(layout.gremlins):
                 self._gremlins[row] = layout
-            self._gather(row)
+        self._allocate()
+        self._gather(range(self.num_envs))
+        self.collided = self.collided.copy()
         self.collided[rows] = False
         self._publish()
 
@@ -150,32 +145,38 @@ class BatchSim:
             if finite[row]:
                 self._views[row][0][:] = controls[row]
                 mujoco.mj_step(model, self._datas[row], nstep=substeps)
-            self._gather(row)
+        self._gather(rows)
 
     def _allocate(self) -> None:
+        """New arrays for the rows to be gathered into, so that what was published before stays as it was."""
         n, model = self.num_envs, self.model
-        self._qpos, self._qvel = np.empty((n, model.nq)), np.empty((n, model.nv))
-        self._readings, self._history = np.empty((n, model.nsensordata)), np.empty((n, model.nhistory))
+        self._state = np.empty((n, model.nq + model.nv))
+        self._readings = np.empty((n, model.nsensordata))
+        self._history = np.empty((n, model.nhistory))
         self.time = np.empty(n)
 
-    def _gather(self, row: int) -> None:
-        _, qpos, qvel, readings, history = self._views[row]
-        self._qpos[row] = qpos
-        self._qvel[row] = qvel
-        self._readings[row] = readings
-        self._history[row] = history
-        self.time[row] = self._datas[row].time
+    def _gather(self, rows: Sequence[int]) -> None:
+        nq, state, readings, history, time = self.model.nq, self._state, self._readings, self._history, self.time
+        for row in rows:
+            _, row_qpos, row_qvel, row_readings, row_history = self._views[row]
+            state[row, :nq] = row_qpos
+            state[row, nq:] = row_qvel
+            readings[row] = row_readings
+            history[row] = row_history
+            time[row] = self._datas[row].time
 
     def _publish(self) -> None:
-        robot, qpos, qvel = self.robot, self._qpos, self._qvel
-        # comparisons with NaN are False
-        self.finite = (np.abs(qpos) < STATE_LIMIT).all(axis=1) & (np.abs(qvel) < STATE_LIMIT).all(axis=1)
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            self.pose = robot.pose(qpos)
-            self.velocity = robot.velocity(qvel)
-            self.upright = robot.upright(qpos)
-            self.sensors = {name: self._readings[:, columns] for name, columns in self._sensor_columns.items()}
-            self.sensors |= self._joints.read(qpos, qvel)
+        robot, nq, state = self.robot, self.model.nq, self._state
+        # a comparison with NaN is False
+        self.finite = np.abs(state).max(axis=1) < STATE_LIMIT
+        if not self.finite.all():
+            state[~self.finite] = np.nan
+        qpos, qvel = state[:, :nq], state[:, nq:]
+        self.pose = robot.pose(qpos)
+        self.velocity = robot.velocity(qvel)
+        self.upright = robot.upright(qpos)
+        self.sensors = {name: self._readings[:, columns] for name, columns in self._sensor_columns.items()}
+        self.sensors |= self._joints.read(qpos, qvel)
 
 
 def _history_values(model: mujoco.MjModel, sensor: str) -> slice:
