@@ -51,7 +51,7 @@ FOUR_ROOM_OPENING = 0.8
 MIN_WALL_PIECE = 0.3
 
 MAX_REDRAWS = 100
-MAX_PLACEMENTS = 20_000  # of things in one layout, over all its restarts
+MAX_PLACEMENTS = 10_000  # of things in one layout, over all its restarts
 _FEW, _MANY = 8, 512  # points tried for one thing, one by one and then at once, before the layout is started again
 
 
@@ -158,7 +158,9 @@ class _Placed:
         self, half_size: NDArray[np.float64], keep_out: float, rng: np.random.Generator
     ) -> tuple[float, float] | None:
         """The first of some uniform points that is at least the sum of the keep-outs from everything, if any is."""
-        for x, y in (half_size * (2.0 * rng.random((_FEW, 2)) - 1.0)).tolist():
+        # comparing many points with all things at once is quick only while the things are few
+        one_by_one = max(_FEW, len(self._things) // 4)
+        for x, y in (half_size * (2.0 * rng.random((one_by_one, 2)) - 1.0)).tolist():
             if self._is_free(x, y, keep_out):
                 return x, y
         points = half_size * (2.0 * rng.random((_MANY, 2)) - 1.0)
