@@ -24,8 +24,9 @@ ALLOWED = {
     "runtime": {"nav", "decode"},
     "evaluate": {"nav", "sim", "planner", "skill", "config"},
     "export": {"nav", "sim", "planner", "skill", "evaluate", "config"},
-    "report": {"nav", "sim", "evaluate", "config"},
-    "cli": {"nav", "sim", "planner", "skill", "runtime", "evaluate", "export", "report", "config", "decode"},
+    "draw": {"nav", "sim"},
+    "report": {"nav", "sim", "evaluate", "config", "draw"},
+    "cli": {"nav", "sim", "planner", "skill", "runtime", "evaluate", "export", "report", "draw", "config", "decode"},
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
 TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}
