@@ -131,8 +131,8 @@ class BatchSim:
             for future in futures:
                 future.result()
         total, floor, own = (self._history[:, columns] for columns in self._contact_columns)
-        self.collided = (total > floor + own).any(axis=1) & self.finite
         self._publish()
+        self.collided = (total > floor + own).any(axis=1) & self.finite
 
     def close(self) -> None:
         """Stop the worker threads. The simulations cannot be stepped afterwards."""
