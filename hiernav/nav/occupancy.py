@@ -119,7 +119,7 @@ class VisitMap:
         self.origin = occupancy.origin
         self.counts: NDArray[np.uint8] = np.zeros(occupancy.occupied.shape, dtype=np.uint8)
         self._extent = occupancy.extent
-        self._last_pixel = -1
+        self._last_pixel: tuple[int, int] | None = None
 
     def add(self, positions: ArrayLike) -> None:
         """Follow the robot along positions (2,) or (M, 2), in order of time, world frame [m].
@@ -127,23 +127,23 @@ class VisitMap:
         A pixel counts one when the robot comes into it; resting there adds nothing. Positions outside the map, or not
         finite, count nowhere.
         """
-        points = np.asarray(positions, dtype=np.float64).reshape(-1, 2)
-        if len(points) == 0:
-            return
-        xmin, xmax, ymin, ymax = self._extent
-        inside = (points[:, 0] >= xmin) & (points[:, 0] <= xmax) & (points[:, 1] >= ymin) & (points[:, 1] <= ymax)
-        row, col = nearest_pixel(points, self.counts.shape, self.resolution, self.origin)
-        pixel = np.where(inside, row * self.counts.shape[1] + col, -1)
-        before = np.concatenate(([self._last_pixel], pixel[:-1]))
-        entered, times = np.unique(pixel[(pixel != before) & (pixel >= 0)], return_counts=True)
-        flat = self.counts.reshape(-1)
-        flat[entered] = np.minimum(flat[entered].astype(np.int64) + times, 255)
-        self._last_pixel = int(pixel[-1])
+        for x, y in np.asarray(positions, dtype=np.float64).reshape(-1, 2).tolist():
+            pixel = self._pixel(x, y)
+            if pixel is not None and pixel != self._last_pixel and self.counts[pixel] < 255:
+                self.counts[pixel] += 1
+            self._last_pixel = pixel
 
     def clear(self) -> None:
         """Forget every visit, as at the start of an episode."""
         self.counts = np.zeros_like(self.counts)
-        self._last_pixel = -1
+        self._last_pixel = None
+
+    def _pixel(self, x: float, y: float) -> tuple[int, int] | None:
+        xmin, xmax, ymin, ymax = self._extent
+        if not (xmin <= x <= xmax and ymin <= y <= ymax):
+            return None
+        rows, cols = self.counts.shape
+        return min(int((y - ymin) / self.resolution), rows - 1), min(int((x - xmin) / self.resolution), cols - 1)
 
 
 def empty_map(half_size: tuple[float, float], resolution: float = RESOLUTION) -> OccupancyMap:

@@ -134,8 +134,8 @@ class OptionStep:
 class WaypointOption:
     """Plans of N robots: when each one ends, a new one is asked for.
 
-    A row whose planner finds nothing (NaN) keeps the plan it has, or holds its position if it has none; such
-    refusals are counted.
+    A row whose planner finds nothing (NaN), or whose position is not finite, keeps the plan it has, or holds its
+    position if it has none, and asks again at the next step; such refusals are counted.
     """
 
     planner: Planner
@@ -156,6 +156,8 @@ class WaypointOption:
         self.visits: list[VisitMap | None] = [None] * self.num_rows
         self.counts = np.zeros((self.num_rows, len(TerminationReason)), dtype=np.int64)
         self.refused = np.zeros(self.num_rows, dtype=np.int64)
+        self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
+        self._hit = np.zeros(self.num_rows, dtype=np.int64)  # last waypoint (from 1) that meets it, 0 if none does
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Forget plans, visits and counts of some rows (all by default), as at the start of an episode."""
@@ -163,83 +165,107 @@ class WaypointOption:
         self.plan[rows], self.start[rows] = np.nan, np.nan
         self.started[rows], self.age[rows] = False, 0
         self.counts[rows], self.refused[rows] = 0, 0
-        for row in rows:
+        for row in rows.tolist():
             self.visits[row] = None
 
     def drop(self, rows: np.ndarray | None = None) -> None:
         """Give up the plans of some rows without forgetting the episode, as when the goal has changed."""
         self.started[slice(None) if rows is None else rows] = False
 
-    def step(self, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]) -> OptionStep:
-        """One control step: end the options that are due and plan anew for their rows.
+    def step(
+        self,
+        position: np.ndarray,
+        goal: np.ndarray,
+        occupancy: Sequence[OccupancyMap],
+        rows: np.ndarray | None = None,
+    ) -> OptionStep:
+        """One control step: end the options that are due and plan anew for them.
 
         Args:
-            position: (N, 2) world frame [m].
-            goal: (N, 2) world frame [m].
-            occupancy: N maps as they are now.
+            position: (M, 2) world frame [m].
+            goal: (M, 2) world frame [m].
+            occupancy: M maps as they are now.
+            rows: (M,) the rows these belong to; all N by default.
+
+        Returns:
+            The step of those M rows.
         """
+        rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-        for row in range(self.num_rows):
+        for row, where, now in zip(rows.tolist(), position, occupancy, strict=True):
             visits = self.visits[row]
             if visits is None:
-                visits = self.visits[row] = VisitMap(occupancy[row])
-            visits.add(position[row])
-        self.age += 1
-        reason = self._reasons(position, goal, occupancy)
-        self.counts[np.arange(self.num_rows), reason] += 1
-        rows = np.flatnonzero((reason != TerminationReason.NONE) & (reason != TerminationReason.GOAL))
+                visits = self.visits[row] = VisitMap(now)
+            visits.add(where)
+        self.age[rows] += 1
+        reason = self._reasons(rows, position, goal, occupancy)
+        self.counts[rows, reason] += 1
+        due = np.flatnonzero((reason != TerminationReason.NONE) & (reason != TerminationReason.GOAL))
         began = time.perf_counter()
-        if len(rows):
-            self._replan(rows, position, goal, occupancy)
-        return OptionStep(reason, self.plan.copy(), self.start.copy(), time.perf_counter() - began)
+        if len(due):
+            self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due])
+        return OptionStep(reason, self.plan[rows], self.start[rows], time.perf_counter() - began)
 
     def line(self) -> np.ndarray:
         """(N, K + 1, 2) active plans with the position they were made from in front."""
         return path.polyline(self.start, self.plan)
 
-    def _reasons(self, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]) -> np.ndarray:
-        line = self.line()
-        index, distance = path.nearest_vertex(position[:, None], line)
-        blocked = np.zeros(self.num_rows, dtype=bool)
-        if self.rule.invalid:
-            for row in np.flatnonzero(self.started):
-                rest = self.plan[row, max(index[row, 0] - 1, 0) :]
-                blocked[row] = not occupancy[row].is_free(rest, self.sweep_radius).all()
-            # a blocked plan that was made where the robot still stands would only be proposed again
-            blocked &= (self.age > 1) & (np.linalg.norm(position - self.start, axis=-1) > 0.05)
+    def _reasons(
+        self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
+    ) -> np.ndarray:
+        index, distance = path.nearest_vertex(position[:, None], path.polyline(self.start[rows], self.plan[rows]))
+        blocked = self._sweep(rows, occupancy) >= np.maximum(index[:, 0], 1)
+        # a blocked plan that was made where the robot still stands would only be proposed again
+        blocked &= (self.age[rows] > 1) & (np.linalg.norm(position - self.start[rows], axis=-1) > 0.05)
         return self.rule(
             distance[:, 0],
             index[:, 0],
             self.num_waypoints,
-            age=self.age,
+            age=self.age[rows],
             blocked=blocked,
             at_goal=np.linalg.norm(position - goal, axis=-1) <= self.goal_radius,
-            started=self.started,
+            started=self.started[rows],
         )
+
+    def _sweep(self, rows: np.ndarray, occupancy: Sequence[OccupancyMap]) -> np.ndarray:
+        """Last waypoint, counted from 1, of each row's plan that meets its map; 0 if none does: (M,)."""
+        if self.rule.invalid:
+            for row, now in zip(rows.tolist(), occupancy, strict=True):
+                if self._swept[row] is not now:
+                    met = np.flatnonzero(~now.is_free(self.plan[row], self.sweep_radius))
+                    self._hit[row] = met[-1] + 1 if len(met) else 0
+                    self._swept[row] = now
+        return self._hit[rows]
 
     def _replan(
         self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
     ) -> None:
-        query = PlanQuery(
-            position=position[rows],
-            goal=goal[rows],
-            occupancy=[occupancy[row] for row in rows],
-            visits=[visits for row in rows if (visits := self.visits[row]) is not None],
-            previous=np.where(self.started[rows][:, None, None], self.plan[rows], np.nan),
-        )
-        plan = np.asarray(self.planner.plan(query), dtype=np.float64)
-        expected = (len(rows), self.num_waypoints, 2)
-        if plan.shape != expected:
-            raise ValueError(f"planner returned waypoints of shape {plan.shape}, expected {expected}")
+        plan = np.full((len(rows), self.num_waypoints, 2), np.nan)
+        known = np.flatnonzero(np.isfinite(position).all(axis=1) & np.isfinite(goal).all(axis=1))
+        if len(known):
+            visits = [self.visits[row] for row in rows[known].tolist()]
+            query = PlanQuery(
+                position=position[known],
+                goal=goal[known],
+                occupancy=[occupancy[k] for k in known],
+                visits=[v for v in visits if v is not None],
+                previous=np.where(self.started[rows[known]][:, None, None], self.plan[rows[known]], np.nan),
+            )
+            proposed = np.asarray(self.planner.plan(query), dtype=np.float64)
+            if proposed.shape != plan[known].shape:
+                raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
+            plan[known] = proposed
         good = np.isfinite(plan).all(axis=(1, 2))
         self.refused[rows[~good]] += 1
         hold = ~good & ~np.isfinite(self.plan[rows]).all(axis=(1, 2))
-        plan[hold] = position[rows[hold]][:, None]
+        plan[hold] = position[hold][:, None]
         accepted = good | hold
         self.plan[rows[accepted]] = plan[accepted]
-        self.start[rows[accepted]] = position[rows[accepted]]
+        self.start[rows[accepted]] = position[accepted]
         self.started[rows[good]] = True
         self.age[rows] = 0
+        for row in rows.tolist():
+            self._swept[row] = None
 
 
 @dataclass

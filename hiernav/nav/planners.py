@@ -159,4 +159,3 @@ def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMa
     leaving = np.arange(clearance.shape[1]) * spacing < 0.15
     excused = leaving & (np.diff(clearance, axis=1, prepend=escape) >= -1e-6) & (clearance >= escape - 1e-6)
     return np.where(finite, np.where(excused, np.inf, clearance).min(axis=1, initial=np.inf), np.nan)
-

@@ -1,0 +1,333 @@
+"""Where the robot is and how fast it moves, from noisy, late and sometimes missing sensors."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, wrap
+from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """Noise of the sensors (standard deviations per component) and limits of trust."""
+
+    gyro_sigma: float = 0.02
+    """[rad/s]"""
+    velocimeter_sigma: float = 0.02
+    """[m/s]"""
+    magnetometer_sigma: float = 0.01
+    """In units of the magnetic field."""
+    fix_sigma: float = 0.02
+    """[m]"""
+    magnetic_field: tuple[float, float, float] = (0.0, -0.5, 0.0)
+    """In the world frame; MuJoCo's default."""
+    tilts: bool = True
+    """Whether the body can roll and pitch. False for a robot that is flat by construction: up is then known."""
+    velocity_walk: float = 0.7
+    """How fast the velocity wanders between readings [m/s per sqrt(s)]."""
+    yaw_walk: float = 0.03
+    """Error of the integrated gyro, besides its noise and its change within a tick [rad per sqrt(s)]."""
+    bias_walk: float = 0.002
+    """How fast the gyro's bias wanders [rad/s per sqrt(s)]."""
+    bias_sigma: float = 0.05
+    """Gyro bias to be expected at the start [rad/s]."""
+    gate_probability: float = 0.9995
+    """Share of good measurements that pass the chi-square gate."""
+    reinit_after: int = 10
+    """Fixes (or headings) rejected in a row after which that part of the state starts again."""
+    resync_after: int = 3
+    """Velocities or turning rates rejected in a row after which they are believed."""
+    reinit_spread: float = 0.3
+    """The last two rejected measurements must agree to this to be believed [m, m/s, rad; rad/s: `max_jump`]."""
+    max_gap: float = 1.0
+    """Without a frame for this long, nothing of the state is worth keeping [s]."""
+    history: float = 0.5
+    """Oldest fix that can still be used [s]."""
+    max_jump: float = 6.0
+    """A gyro reading that differs more than this from the last is taken for a spike [rad/s]."""
+
+    def __post_init__(self) -> None:
+        for name, value in self.__dict__.items():
+            if isinstance(value, float) and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"EstimatorConfig.{name} = {value} must be finite and positive")
+        if not self.gate_probability < 1.0:
+            raise ValueError(f"EstimatorConfig.gate_probability = {self.gate_probability} must be below 1")
+        for name in ("reinit_after", "resync_after"):
+            if getattr(self, name) < 2:
+                raise ValueError(f"EstimatorConfig.{name} = {getattr(self, name)} must be at least 2")
+        if not math.hypot(*self.magnetic_field[:2]) > 0.0:
+            raise ValueError(f"EstimatorConfig.magnetic_field = {self.magnetic_field} must have a horizontal part")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """State at `stamp`."""
+
+    stamp: float
+    """On the robot's clock [s]."""
+    pose: np.ndarray
+    """(3,) x, y, yaw; world frame [m, m, rad]."""
+    velocity: np.ndarray
+    """(2,) world frame [m/s]."""
+    covariance: np.ndarray
+    """(6, 6) of x, y, yaw, forward and left velocity (heading frame), gyro bias."""
+    upright: float
+    """z component of the body's z axis: 1 upright, 0 on its side, -1 on its back."""
+    yaw_rate: float
+    """Turning rate of the heading without the gyro's bias [rad/s]."""
+
+
+class Estimator:
+    """Planar state estimator: predicts at the control rate, corrects with whatever passes its gate."""
+
+    def __init__(self, config: EstimatorConfig | None = None) -> None:
+        self.config = config = config or EstimatorConfig()
+        self.counts: Counter[str] = Counter()
+        """How often something was dropped, rejected or started again, by name."""
+        self.last_accepted: dict[str, float] = {}
+        """Stamp of the last measurement accepted from each sensor [s]."""
+        self._field = math.hypot(*config.magnetic_field)
+        self._field_heading = math.atan2(config.magnetic_field[1], config.magnetic_field[0])
+        self._gate_1 = float(chdtri(1, 1.0 - config.gate_probability))
+        self._gate_2 = float(chdtri(2, 1.0 - config.gate_probability))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the state, as after being carried away. Counts are kept."""
+        config = self.config
+        self._filter = PlanarFilter(config.velocity_walk, config.bias_walk)
+        self._filter.replace(VELOCITY, (0.0, 0.0), 1.0)
+        self._filter.replace(slice(BIAS, BIAS + 1), (0.0,), config.bias_sigma**2)
+        self._tilt = TiltFilter(
+            dip_sine=config.magnetic_field[2] / self._field,
+            gyro_walk=0.3,
+            magnetometer_sigma=max(1.5 * config.magnetometer_sigma / self._field, 0.01),
+            accelerometer_sigma=(0.3, 3.0),
+        )
+        self._stamp = -math.inf
+        self._step = 0.0
+        self._fix_stamp = -math.inf
+        self._rate: Vector = (0.0, 0.0, 0.0)
+        self._yaw_rate = 0.0
+        self._has_position = self._has_yaw = False
+        self._rejected: Counter[str] = Counter()
+        self._last_miss: dict[str, tuple[float, ...]] = {}
+        self._history: deque[list[float]] = deque()
+
+    @property
+    def ready(self) -> bool:
+        """Whether position and heading have been measured at least once."""
+        return self._has_position and self._has_yaw
+
+    def update(self, frame: SensorFrame) -> Estimate | None:
+        """Take in one frame.
+
+        A frame whose stamp is not after the last one is dropped as a whole, a fix whose stamp is not after the last
+        fix alone. Values that are not finite count as missing.
+
+        Returns:
+            The state at the newest stamp; None until position and heading are known.
+        """
+        if self._accept_stamp(float(frame.stamp)):
+            field = self._trusted_field(frame.magnetometer)
+            self._predict(frame, field)
+            forward, left = level_axes(self._tilt.up)
+            self._correct_yaw(field, forward, left)
+            self._correct_velocity(_vector(frame.velocimeter, 3), forward, left)
+            self._remember()
+            self._correct_position(frame)
+        return self._estimate() if self.ready else None
+
+    def _accept_stamp(self, stamp: float) -> bool:
+        """Move on to `stamp`; False if the frame is to be dropped."""
+        if not math.isfinite(stamp) or stamp <= self._stamp:
+            self.counts["stale_frame"] += 1
+            return False
+        if stamp - self._stamp > self.config.max_gap and math.isfinite(self._stamp):
+            self.counts["gap"] += 1
+            self.reset()
+        self._step = stamp - self._stamp if math.isfinite(self._stamp) else 0.0
+        self._stamp = stamp
+        return True
+
+    def _predict(self, frame: SensorFrame, field: Vector | None) -> None:
+        """Bring tilt, heading and position to the new stamp."""
+        config = self.config
+        dt, first = self._step, self._step == 0.0
+        rate, change = self._measured_rate(frame.gyro)
+        if first:
+            self._rate = rate
+        mean = _mean(self._rate, rate)
+        if config.tilts:
+            if dt > 0.0:
+                self._tilt.predict(dt, mean, change)
+            self._tilt.correct(field, _vector(frame.accelerometer, 3), self._gate_1)
+        _, uy, uz = self._tilt.up
+        # Of the body rates, what turns the heading: Euler's kinematic equation for yaw, in terms of `up`.
+        level = max(uy * uy + uz * uz, 1e-2)
+        self._yaw_rate = (rate[1] * uy + rate[2] * uz) / level
+        if dt > 0.0:
+            mean_yaw_rate = (mean[1] * uy + mean[2] * uz) / level
+            variance = config.yaw_walk**2 * dt + (config.gyro_sigma * dt) ** 2 + (0.5 * change * dt) ** 2
+            self._filter.predict_motion(dt, mean_yaw_rate, math.sqrt(variance))
+        self._rate = rate
+
+    def _measured_rate(self, gyro: np.ndarray | None) -> tuple[Vector, float]:
+        """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
+        rate = _vector(gyro, 3)
+        if rate is None:
+            return self._rate, 1.0
+        jump = math.dist(rate, self._rate)
+        # One reading far off is a spike; three in a row are the truth.
+        if jump > self.config.max_jump and not self._reject("gyro", rate, self.config.max_jump):
+            return self._rate, 1.0
+        self._accept("gyro")
+        # What a jump adds to the angle is as uncertain as it is large.
+        return rate, jump
+
+    def _trusted_field(self, magnetometer: np.ndarray | None) -> Vector | None:
+        """The magnetometer's reading, if it is as strong as the world's field."""
+        field = _vector(magnetometer, 3)
+        if field is None:
+            return None
+        excess = abs(math.sqrt(dot(field, field)) - self._field)
+        if excess > 6.0 * self.config.magnetometer_sigma + 0.05 * self._field:
+            self.counts["magnetometer_rejected"] += 1
+            return None
+        return field
+
+    def _correct_yaw(self, field: Vector | None, forward: Vector, left: Vector) -> None:
+        if field is None:
+            return
+        ahead, aside = dot(field, forward), dot(field, left)
+        level = math.hypot(ahead, aside)
+        if level < 0.2 * self._field:
+            return
+        yaw = self._field_heading - math.atan2(aside, ahead)
+        variance = (self.config.magnetometer_sigma / level) ** 2 + 1e-4
+        if not self._has_yaw:
+            self._has_yaw = True
+            self._filter.replace(slice(YAW, YAW + 1), (wrap(yaw),), variance)
+        elif not self._filter.correct_yaw(miss := wrap(yaw - self._filter.yaw), variance, self._gate_1):
+            if not self._reject("magnetometer", (miss,)):
+                return
+            self._filter.replace(slice(YAW, YAW + 1), (wrap(yaw),), variance)
+        self._accept("magnetometer")
+
+    def _correct_velocity(self, velocity: Vector | None, forward: Vector, left: Vector) -> None:
+        if velocity is None:
+            return
+        ahead, aside = dot(velocity, forward), dot(velocity, left)
+        tilt_variance = self._tilt.sigma**2 * dot(velocity, velocity) if self.config.tilts else 0.0
+        variance = self.config.velocimeter_sigma**2 + min(tilt_variance, 1.0)
+        _, _, _, vx, vy, _ = self._filter.x.tolist()
+        miss = (ahead - vx, aside - vy)
+        if not self._filter.correct_pair(VELOCITY, miss, variance, self._gate_2):
+            if not self._reject("velocimeter", miss):
+                return
+            self._filter.replace(VELOCITY, (ahead, aside), variance)
+        self._accept("velocimeter")
+
+    def _remember(self) -> None:
+        x, y = self._filter.x[POSITION].tolist()
+        self._history.append([self._stamp, x, y])
+        while self._history[0][0] < self._stamp - self.config.history:
+            self._history.popleft()
+
+    def _correct_position(self, frame: SensorFrame) -> None:
+        fix = _vector(frame.position_fix, 2)
+        if fix is None:
+            if frame.position_fix is not None:
+                self.counts["fix_not_finite"] += 1
+            return
+        stamp = self._stamp if frame.fix_stamp is None else float(frame.fix_stamp)
+        if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
+            self.counts["stale_fix"] += 1
+            return
+        self._fix_stamp = stamp
+        then = self._position_at(stamp)
+        miss = (fix[0] - then[0], fix[1] - then[1])
+        variance = self.config.fix_sigma**2
+        before = self._filter.x[POSITION]
+        if self._has_position and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
+            self._shift_history(stamp, self._filter.x[POSITION] - before)
+        elif self._has_position and not self._reject("position_fix", miss):
+            return
+        else:
+            self._has_position = True
+            self._filter.replace(POSITION, before + miss, variance)
+            self._shift_history(-math.inf, np.array(miss))
+        self._accept("position_fix")
+
+    def _position_at(self, stamp: float) -> tuple[float, float]:
+        """Where the filter has the robot at `stamp`, which lies within the history [m]."""
+        later = self._history[-1]
+        for entry in reversed(self._history):
+            if entry[0] <= stamp:
+                share = (stamp - entry[0]) / (later[0] - entry[0]) if later is not entry else 0.0
+                return entry[1] + share * (later[1] - entry[1]), entry[2] + share * (later[2] - entry[2])
+            later = entry
+        return later[1], later[2]
+
+    def _shift_history(self, stamp: float, change: np.ndarray) -> None:
+        """Let the past know of a correction, so that the next late fix is not compared with what is already mended."""
+        dx, dy = change.tolist()
+        for entry in reversed(self._history):
+            if entry[0] < stamp:
+                break
+            entry[1] += dx
+            entry[2] += dy
+
+    def _accept(self, sensor: str) -> None:
+        self._rejected[sensor] = 0
+        self.last_accepted[sensor] = self._stamp
+
+    def _reject(self, sensor: str, miss: tuple[float, ...], spread: float | None = None) -> bool:
+        """Count a rejected measurement.
+
+        True if it is to be believed after all: there were so many in a row that the state must be wrong, and it agrees
+        with the one before, so that it is no lone spike.
+        """
+        last = self._last_miss.get(sensor)
+        self._last_miss[sensor] = miss
+        agrees = last is not None and math.dist(miss, last) <= (spread or self.config.reinit_spread)
+        self.counts[f"{sensor}_rejected"] += 1
+        self._rejected[sensor] += 1
+        patience = self.config.resync_after if sensor in ("velocimeter", "gyro") else self.config.reinit_after
+        if self._rejected[sensor] < patience or not agrees:
+            return False
+        self.counts[f"{sensor}_reinit"] += 1
+        return True
+
+    def _estimate(self) -> Estimate:
+        x, y, yaw, ahead, aside, bias = self._filter.x.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return Estimate(
+            stamp=self._stamp,
+            pose=np.array([x, y, yaw]),
+            velocity=np.array([cos * ahead - sin * aside, sin * ahead + cos * aside]),
+            covariance=self._filter.P.copy(),
+            upright=self._tilt.up[2],
+            yaw_rate=self._yaw_rate - bias,
+        )
+
+
+def _vector(value: np.ndarray | None, size: int) -> tuple[float, ...] | None:
+    """The finite components of a measurement as floats; None if it is missing, misshapen or not finite."""
+    if value is None:
+        return None
+    values = np.asarray(value, dtype=np.float64).ravel().tolist()
+    if len(values) != size or not all(map(math.isfinite, values)):
+        return None
+    return tuple(values)
+
+
+def _mean(a: Vector, b: Vector) -> Vector:
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

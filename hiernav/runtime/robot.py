@@ -1,0 +1,106 @@
+"""What the runtime asks of a robot: read, send, brake."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+VECTOR_SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
+
+
+@dataclass(frozen=True)
+class SensorFrame:
+    """What the robot's sensors say at one moment. A sensor that gave nothing is None; values may be garbage."""
+
+    stamp: float
+    """When the inertial sensors were read, on the robot's monotonic clock [s]."""
+    accelerometer: np.ndarray | None = None
+    """(3,) specific force in the body frame: +g along z at rest [m/s^2]."""
+    gyro: np.ndarray | None = None
+    """(3,) angular velocity in the body frame [rad/s]."""
+    magnetometer: np.ndarray | None = None
+    """(3,) magnetic field in the body frame."""
+    velocimeter: np.ndarray | None = None
+    """(3,) velocity of the body origin in the body frame [m/s]."""
+    lidar: np.ndarray | None = None
+    """(10,) closeness, body frame."""
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """The robot's own observation terms by name."""
+    position_fix: np.ndarray | None = None
+    """(2,) position of the body origin in the world frame [m]."""
+    fix_stamp: float | None = None
+    """When the position was measured, on the same clock; `stamp` if None [s]."""
+
+    def terms(self) -> dict[str, np.ndarray]:
+        """Every observation term that this frame has, by name, 1-D each."""
+        present = {name: getattr(self, name) for name in (*VECTOR_SENSORS, "lidar")}
+        return {name: value for name, value in present.items() if value is not None} | dict(self.extra)
+
+
+class Robot(Protocol):
+    """A robot, simulated or real. Adapters brake by themselves when commands stop coming (`CommandWatchdog`)."""
+
+    @property
+    def control_period(self) -> float:
+        """Time between two commands [s]."""
+        ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    def read(self) -> SensorFrame:
+        """The newest sensor values, without waiting for newer ones."""
+        ...
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        """Command (A,) in [-1, 1]; returns what was really sent."""
+        ...
+
+    def brake(self) -> None:
+        """Command the safe stop. May be called at any time and any number of times."""
+        ...
+
+    def close(self) -> None:
+        """Release the robot; it has been braked before."""
+        ...
+
+
+class CommandWatchdog:
+    """Tells an adapter that its last command is too old to be followed."""
+
+    def __init__(self, control_period: float, timeout: float = 0.05) -> None:
+        """
+        Args:
+            control_period: [s].
+            timeout: age at which a command expires [s]. At least one and a half control periods are granted, so
+                that a robot with a period above the timeout can be driven at all.
+
+        Raises:
+            ValueError: a time is not finite and positive.
+        """
+        for name, value in (("control_period", control_period), ("timeout", timeout)):
+            if not 0.0 < value < float("inf"):
+                raise ValueError(f"CommandWatchdog: {name} {value} s must be finite and positive")
+        self.timeout = max(timeout, 1.5 * control_period)
+        self.trips = 0
+        self._fed_at: float | None = None
+        self._tripped = False
+
+    def feed(self, now: float) -> None:
+        """A command arrived at `now` [s]."""
+        self._fed_at = now
+        self._tripped = False
+
+    def expired(self, now: float) -> bool:
+        """Whether the robot must brake at `now` [s]; also before the first command. Each expiry counts as one trip."""
+        if self._fed_at is None:
+            return True
+        if now - self._fed_at <= self.timeout:
+            return False
+        if not self._tripped:
+            self._tripped = True
+            self.trips += 1
+        return True

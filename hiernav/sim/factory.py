@@ -1,0 +1,88 @@
+"""Tasks from a configuration: the same for training, evaluation and Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hiernav.config import TrainConfig
+from hiernav.nav.observation import observation_layout
+from hiernav.nav.option import Planner, ReplanRule, WaypointOption
+from hiernav.nav.planners import ShortestPathPlanner
+from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.sim.task import LayoutSource, NavigationTask
+from hiernav.sim.worlds import sample_layout
+
+
+class RandomLayouts:
+    """Endless layouts of one or several worlds; row r's episode k is the same whatever the other rows do.
+
+    Args:
+        worlds: drawn from in equal parts.
+        seed: entropy of the whole sequence, any number of integers.
+        robot_radius: for the check that a world can be solved [m].
+    """
+
+    def __init__(self, worlds: Sequence[WorldSpec], seed: Sequence[int], robot_radius: float) -> None:
+        self.worlds, self.seed, self.robot_radius = tuple(worlds), tuple(seed), robot_radius
+        self._episodes: dict[int, int] = {}
+
+    def __call__(self, row: int) -> Layout:
+        episode = self._episodes.get(row, 0)
+        self._episodes[row] = episode + 1
+        which, seed = np.random.SeedSequence(self.seed, spawn_key=(row, episode)).generate_state(2)
+        return sample_layout(self.worlds[which % len(self.worlds)], int(seed), self.robot_radius)
+
+
+def expert_planner(config: TrainConfig) -> ShortestPathPlanner:
+    """The shortest-path planner with the radius and margin of a configuration."""
+    radius = config.planner.planning_radius_m or get_robot(config.robot).radius
+    return ShortestPathPlanner(
+        radius, config.planner.soft_margin_m, num_waypoints=config.option.waypoints, spacing=config.option.spacing_m
+    )
+
+
+def make_task(
+    config: TrainConfig,
+    num_rows: int,
+    planner: Planner | None = None,
+    worlds: Sequence[WorldSpec] | None = None,
+    layouts: LayoutSource | None = None,
+) -> NavigationTask:
+    """The task of a configuration.
+
+    Args:
+        config: robot, option, reward and kind of guidance.
+        num_rows: robots side by side.
+        planner: guides them; the expert by default.
+        worlds: that `layouts` may draw from; the skill's training world by default.
+        layouts: random ones from the configuration's seed by default.
+    """
+    robot = get_robot(config.robot)
+    worlds = [parse_world(config.skill.world)] if worlds is None else list(worlds)
+    option = WaypointOption(
+        planner or expert_planner(config),
+        num_rows,
+        replan_rule(config),
+        num_waypoints=config.option.waypoints,
+        goal_radius=GOAL_RADIUS,
+        sweep_radius=robot.radius,
+    )
+    guidance = "goal" if config.skill.preset == "baseline" else "waypoints"
+    return NavigationTask(
+        robot,
+        worlds,
+        layouts or RandomLayouts(worlds, (config.seed,), robot.radius),
+        option,
+        observation_layout(config.robot, guidance),
+        config.reward,
+        config.threads,
+    )
+
+
+def replan_rule(config: TrainConfig) -> ReplanRule:
+    """The termination rule of a configuration."""
+    option = config.option
+    return ReplanRule(option.d_update_m, option.half_fraction, option.invalid, option.period)

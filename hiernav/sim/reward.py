@@ -1,0 +1,63 @@
+"""Reward terms: pure functions of poses and of the plan that was active during the step (paper Eq. 3 and 5).
+
+Named terms -> weights -> sum. Each term is logged by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hiernav.config import RewardConfig
+from hiernav.nav import path
+
+TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "goal_distance")
+
+
+def weighted_sum(config: RewardConfig, terms: dict[str, np.ndarray]) -> np.ndarray:
+    """Reward (N,): the sum of the terms, each times its weight."""
+    return sum((getattr(config, name) * terms[name] for name in TERMS), start=np.zeros(len(terms["goal"])))
+
+
+def reward_terms(
+    config: RewardConfig,
+    before: np.ndarray,
+    after: np.ndarray,
+    line: np.ndarray,
+    goal: np.ndarray,
+    collided: np.ndarray,
+    reached: np.ndarray,
+    left: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Unweighted terms of one control step, each (N,) float64.
+
+    Args:
+        before, after: (N, 2) position at both ends of the step [m].
+        line: (N, K + 1, 2) plan active DURING the step, with the position it was made from in front [m].
+        goal: (N, 2) [m].
+        collided, reached, left: (N,) bool.
+    """
+    vertices = path.divide(line, config.division_m)
+    count = count_progress if config.preset == "paper" else signed_progress
+    return {
+        "path_distance": path.path_distance(before, after, vertices, config.division_m),
+        "progress": count(before, after, line, vertices, config.division_m),
+        "collision": collided.astype(np.float64),
+        "goal": reached.astype(np.float64),
+        "leave_field": left.astype(np.float64),
+        "goal_distance": np.linalg.norm(after - goal, axis=-1),
+    }
+
+
+def count_progress(
+    before: np.ndarray, after: np.ndarray, line: np.ndarray, vertices: np.ndarray, spacing: float
+) -> np.ndarray:
+    """n_progress of the paper: NNI(x_t+1) - NNI(x_t) on the divided plan."""
+    index, _ = path.nearest_vertex(np.stack([before, after], axis=1), vertices)
+    return (index[:, 1] - index[:, 0]).astype(np.float64)
+
+
+def signed_progress(
+    before: np.ndarray, after: np.ndarray, line: np.ndarray, vertices: np.ndarray, spacing: float
+) -> np.ndarray:
+    """Progress along the plan in units of the spacing, signed before its first vertex: closed motions earn nothing."""
+    return (path.signed_progress(after, line) - path.signed_progress(before, line)) / spacing

@@ -1,0 +1,168 @@
+"""The navigation task: a batch of robots in sampled worlds, their options, observations and rewards.
+
+One implementation under the TorchRL environment, the Gymnasium environment and the evaluation. The option lives in
+here because the next observation must hold the waypoints of the next state, which may have been replanned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hiernav.config import RewardConfig
+from hiernav.nav.lidar import lidar_closeness
+from hiernav.nav.observation import ObservationLayout
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.option import OptionStep, WaypointOption, guided
+from hiernav.sim.batch import BatchSim
+from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec
+from hiernav.sim.reward import reward_terms, weighted_sum
+from hiernav.sim.robots import RobotSpec
+from hiernav.sim.scene import scene_for
+
+LayoutSource = Callable[[int], Layout]
+"""Row -> the layout of its next episode."""
+
+
+@dataclass
+class TaskStep:
+    """Outcome of one control step; new arrays every time."""
+
+    observation: np.ndarray
+    """(N, D) float32 of the state after the step."""
+    reward: np.ndarray
+    """(N,)"""
+    terms: dict[str, np.ndarray]
+    """Unweighted reward terms, (N,) each."""
+    reached: np.ndarray
+    """(N,) bool: goal within 0.3 m."""
+    left: np.ndarray
+    """(N,) bool: centre outside the field."""
+    truncated: np.ndarray
+    """(N,) bool: cap on steps reached."""
+    collided: np.ndarray
+    """(N,) bool: contact with an obstacle during the step."""
+    broken: np.ndarray
+    """(N,) bool: the physics is no longer finite."""
+    option: OptionStep
+
+    @property
+    def terminated(self) -> np.ndarray:
+        """(N,) bool: the episode has ended for good (goal or field left)."""
+        return self.reached | self.left | self.broken
+
+
+class NavigationTask:
+    """N robots, each with a world, a goal and an option.
+
+    Args:
+        robot: which robot.
+        worlds: every kind of world that `layouts` may draw; the scene gets enough obstacle slots for any of them.
+        layouts: draws the layout of a row's next episode.
+        option: plans for the N rows; its planner is what guides the robots.
+        layout: of the observation.
+        reward: weights of its terms.
+        threads: that step the physics.
+    """
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        worlds: Sequence[WorldSpec],
+        layouts: LayoutSource,
+        option: WaypointOption,
+        layout: ObservationLayout,
+        reward: RewardConfig | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.robot, self.layout, self.option = robot, layout, option
+        self.num_rows = option.num_rows
+        self.reward = reward or RewardConfig()
+        self.sim = BatchSim(robot, self.num_rows, scene_for(worlds), threads)
+        self._draw = layouts
+        self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
+        self._maps: list[OccupancyMap] = [None] * self.num_rows  # type: ignore[list-item]
+        self.goal = np.zeros((self.num_rows, 2))
+        self.steps = np.zeros(self.num_rows, dtype=np.int64)
+        self._max_steps = np.zeros(self.num_rows, dtype=np.int64)
+        self._points = np.full((self.num_rows, 1, 2), np.nan)
+        self._moving = np.zeros(self.num_rows, dtype=bool)
+        self.observation = np.zeros((self.num_rows, layout.size), dtype=np.float32)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(N, 3) true pose, world frame [m, m, rad]."""
+        return self.sim.pose
+
+    def reset(self, rows: np.ndarray | None = None, layouts: Sequence[Layout] | None = None) -> np.ndarray:
+        """Start new episodes in some rows (all by default), in drawn or given layouts.
+
+        Returns:
+            (N, D) float32 observations; rows that were not reset keep theirs.
+        """
+        rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
+        drawn = [self._draw(int(row)) for row in rows] if layouts is None else list(layouts)
+        self.sim.reset(rows, drawn)
+        for row, layout in zip(rows, drawn, strict=True):
+            self.layouts[row] = layout
+            self._maps[row] = layout.occupancy(0.0)
+            self.goal[row] = layout.goal
+            self._max_steps[row] = layout.spec.max_steps
+            self._moving[row] = len(layout.gremlins) > 0
+            self._set_points(row, layout.obstacle_points(0.0))
+        self.steps[rows] = 0
+        self.option.reset(rows)
+        self._observe(rows)
+        return self.observation
+
+    def step(self, actions: np.ndarray) -> TaskStep:
+        """One control step of all rows with actions (N, A) in [-1, 1]."""
+        if not self.option.started.any():
+            raise RuntimeError("reset the task before its first step")
+        before, line = self.sim.pose[:, :2].copy(), self.option.line()
+        self.sim.step(actions)
+        self.steps += 1
+        for row in np.flatnonzero(self._moving):
+            now = float(self.sim.time[row])
+            self._maps[row] = self.layouts[row].occupancy(now)
+            self._set_points(row, self.layouts[row].obstacle_points(now))
+        after = self.sim.pose[:, :2]
+        broken = ~self.sim.finite
+        reached = np.linalg.norm(after - self.goal, axis=-1) <= GOAL_RADIUS
+        left = ~np.array([layout.in_field(after[row][None])[0] for row, layout in enumerate(self.layouts)])
+        reached &= ~left
+        collided = self.sim.collided
+        terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left)
+        option = self._observe(np.arange(self.num_rows))
+        return TaskStep(
+            observation=self.observation,
+            reward=weighted_sum(self.reward, terms),
+            terms=terms,
+            reached=reached,
+            left=left & ~broken,
+            truncated=(self.steps >= self._max_steps) & ~reached & ~left & ~broken,
+            collided=collided,
+            broken=broken,
+            option=option,
+        )
+
+    def _observe(self, rows: np.ndarray) -> OptionStep:
+        """Let the options of some rows end or go on, then observe."""
+        pose = self.sim.pose[rows]
+        option = self.option.step(pose[:, :2], self.goal[rows], [self._maps[row] for row in rows], rows)
+        values = guided({k: v[rows] for k, v in self.sim.sensors.items()}, pose, option.plan, self.goal[rows])
+        values["lidar"] = lidar_closeness(pose, self._points[rows])
+        observation = self.observation.copy()
+        observation[rows] = np.nan_to_num(self.layout.build(values))  # a broken row is reported, not passed on
+        self.observation = observation
+        return option
+
+    def _set_points(self, row: int, points: np.ndarray) -> None:
+        if len(points) > self._points.shape[1]:
+            wider = np.full((self.num_rows, len(points), 2), np.nan)
+            wider[:, : self._points.shape[1]] = self._points
+            self._points = wider
+        self._points[row] = np.nan
+        self._points[row, : len(points)] = points

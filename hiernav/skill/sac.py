@@ -1,0 +1,95 @@
+"""Soft actor-critic on torchrl's SACLoss: networks, one update, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, TensorDictModule
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, ValueEstimators
+
+from hiernav.nav.observation import ObservationLayout
+from hiernav.skill.networks import Actor, Critic
+
+
+@dataclass(frozen=True)
+class SacSettings:
+    """Hyper-parameters of the learner (paper appendix, after Haarnoja et al. 2018)."""
+
+    hidden: Sequence[int] = (256, 256)
+    discount: float = 0.99
+    tau: float = 0.005
+    learning_rate: float = 3e-4
+    init_alpha: float = 1.0
+    alpha_floor: float = 0.0
+    """The temperature is kept at or above this."""
+    target_entropy: float | None = None
+    """None: minus the number of actions."""
+    layer_norm: bool = False
+    """Layer normalisation in the critics (beyond the paper)."""
+    compile: bool = False
+
+
+class Learner:
+    """Actor, twin critics, temperature and their optimiser.
+
+    The three losses touch disjoint parameters, so one backward pass and one optimiser step serve all.
+    """
+
+    def __init__(self, layout: ObservationLayout, action_dim: int, settings: SacSettings) -> None:
+        self.settings = settings
+        self.actor = Actor(layout, action_dim, settings.hidden, layer_norm=False)
+        self.policy = ProbabilisticActor(
+            TensorDictModule(self.actor, in_keys=["observation"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            distribution_kwargs={"low": -1.0, "high": 1.0, "tanh_loc": False, "safe_tanh": False},
+            default_interaction_type=InteractionType.RANDOM,
+            spec=Bounded(-1.0, 1.0, (action_dim,)),
+        )
+        critic = Critic(layout, action_dim, settings.hidden, settings.layer_norm)
+        self.loss = SACLoss(
+            self.policy,
+            ValueOperator(critic, in_keys=["observation", "action"]),
+            loss_function="l2",
+            alpha_init=settings.init_alpha,
+            min_alpha=settings.alpha_floor or None,
+            target_entropy=-float(action_dim) if settings.target_entropy is None else settings.target_entropy,
+            action_spec=Bounded(-1.0, 1.0, (action_dim,)),
+        )
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
+        self._weights = [p for p in self.loss.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(self._weights, lr=settings.learning_rate, fused=True)
+        self._online = list(self.loss.qvalue_network_params.flatten_keys().values(True, True))
+        self._target = list(self.loss.target_qvalue_network_params.flatten_keys().values(True, True))
+        self._losses = torch.compile(self._compute) if settings.compile else self._compute
+        self.updates = 0
+
+    def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
+        """One gradient step on a batch (B,) of transitions; returns detached scalars."""
+        total, metrics = self._losses(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(self._target, self._online, self.settings.tau)
+        self.updates += 1
+        return metrics
+
+    def _compute(self, batch: TensorDict) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        out = self.loss(batch)
+        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+        return total, {key: out[key].detach() for key in out.keys()}
+
+    def state_dict(self) -> dict:
+        """Everything a resumed run needs of the learner."""
+        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict(), "updates": self.updates}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.updates = state["updates"]

@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
+from runtime_motion import FIX_SIGMA, SIGMA, estimator_for, follow, frames, recorded
+
+ROBOTS = ("point", "car", "doggo")
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_position_is_better_than_one_fix_and_heading_better_than_two_degrees(robot, seed):
+    motion = recorded(robot)
+    errors = follow(motion, estimator_for(motion), frames(motion, seed))
+    assert len(errors.position) == len(motion.stamps)
+    assert errors.position_rms < FIX_SIGMA
+    assert errors.yaw_rms < math.radians(2.0)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_velocity_is_in_the_world_frame(robot):
+    motion = recorded(robot)
+    errors = follow(motion, estimator_for(motion), frames(motion))
+    velocity = np.array([estimate.velocity for estimate in errors.estimates])
+    dt = motion.stamps[1]
+    between = np.diff(motion.poses[:, :2], axis=0) / dt
+    assert np.sqrt(np.mean((0.5 * (velocity[1:] + velocity[:-1]) - between) ** 2)) < 0.06
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_covariance_is_honest(robot):
+    motion = recorded(robot)
+    normalised = []
+    for seed in range(5):
+        errors = follow(motion, estimator_for(motion), frames(motion, seed))
+        for estimate, position in zip(errors.estimates, errors.position, strict=True):
+            normalised.append(position**2 / np.trace(estimate.covariance[:2, :2]))
+    assert 0.3 < np.mean(normalised) < 3.0
+
+
+def test_heading_is_right_while_the_body_rolls_and_pitches():
+    motion = recorded("doggo")
+    assert motion.upright.min() < math.cos(math.radians(40.0))
+    flat = follow(motion, Estimator(EstimatorConfig(tilts=False)), frames(motion))
+    compensated = follow(motion, estimator_for(motion), frames(motion))
+    assert np.abs(compensated.yaw).max() < math.radians(5.0)
+    assert np.abs(flat.yaw).max() > 2.0 * np.abs(compensated.yaw).max()
+    upright = np.array([estimate.upright for estimate in compensated.estimates])
+    assert np.abs(upright - motion.upright).max() < 0.1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("sensor", [*VECTOR_SENSORS, "position_fix"])
+def test_a_value_that_is_not_finite_counts_as_missing(sensor, value):
+    motion = recorded("car")
+    rng = np.random.default_rng(3)
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        reading = getattr(frame, sensor)
+        if reading is None or frame.stamp == 0.0 or rng.random() > 0.3:
+            return frame
+        reading = reading.copy()
+        reading[rng.integers(len(reading))] = value
+        return replace(frame, **{sensor: reading})
+
+    errors = follow(motion, estimator_for(motion), frames(motion), damage)
+    assert all(np.isfinite(estimate.pose).all() for estimate in errors.estimates)
+    assert all(np.isfinite(estimate.covariance).all() for estimate in errors.estimates)
+    assert errors.position_rms < 1.5 * FIX_SIGMA
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_spikes_on_every_sensor_at_most_double_the_position_error(robot, seed):
+    motion = recorded(robot)
+    rng = np.random.default_rng(seed + 100)
+
+    def spike(reading: np.ndarray | None, sigma: float) -> np.ndarray | None:
+        if reading is None or rng.random() > 0.05:
+            return reading
+        return reading + sigma * 10.0 ** rng.uniform(1.0, 3.0) * rng.choice([-1.0, 1.0], len(reading))
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        values = {name: spike(getattr(frame, name), sigma) for name, sigma in SIGMA.items()}
+        return replace(frame, **values, position_fix=spike(frame.position_fix, FIX_SIGMA))
+
+    nominal = follow(motion, estimator_for(motion), frames(motion, seed))
+    estimator = estimator_for(motion)
+    spiked = follow(motion, estimator, frames(motion, seed), damage)
+    assert spiked.position_rms <= 2.0 * nominal.position_rms
+    assert sum(estimator.counts.values()) > 0
+
+
+def test_a_repeated_frame_changes_nothing():
+    motion = recorded("point")
+    stream = list(frames(motion))
+    once, twice = estimator_for(motion), estimator_for(motion)
+    for frame in stream:
+        expected = once.update(frame)
+        twice.update(frame)
+        again = twice.update(replace(frame, velocimeter=np.full(3, 5.0), position_fix=np.full(2, 5.0)))
+        assert expected is not None and again is not None
+        np.testing.assert_array_equal(again.pose, expected.pose)
+        np.testing.assert_array_equal(again.covariance, expected.covariance)
+    assert twice.counts["stale_frame"] == len(stream)
+
+
+def test_a_frame_from_the_past_is_dropped():
+    motion = recorded("point")
+    stream = list(frames(motion))
+    estimator = estimator_for(motion)
+    for frame in stream[:50]:
+        before = estimator.update(frame)
+    after = estimator.update(stream[10])
+    assert before is not None and after is not None
+    np.testing.assert_array_equal(after.pose, before.pose)
+    assert after.stamp == before.stamp
+    assert estimator.counts["stale_frame"] == 1
+
+
+@pytest.mark.parametrize("fix_stamp", [0.3, 0.2, 99.0, math.nan])
+def test_a_fix_that_is_repeated_older_or_from_the_future_is_dropped(fix_stamp):
+    motion = recorded("point")
+    estimator, reference = estimator_for(motion), estimator_for(motion)
+    for frame in list(frames(motion))[:17]:
+        if frame.stamp <= 0.3:
+            estimator.update(frame), reference.update(frame)
+        else:
+            bad = replace(frame, position_fix=frame.velocimeter[:2] + 0.02, fix_stamp=fix_stamp)
+            clean = replace(frame, position_fix=None, fix_stamp=None)
+            after, expected = estimator.update(bad), reference.update(clean)
+            assert after is not None and expected is not None
+            np.testing.assert_array_equal(after.pose, expected.pose)
+    assert estimator.counts["stale_fix"] == 1
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("latency", [0.08, 0.2])
+def test_a_late_fix_is_applied_where_the_robot_was_when_it_was_measured(robot, latency):
+    motion = recorded(robot)
+    late = frames(motion, latency=latency)
+    compensated = follow(motion, estimator_for(motion), late)
+    trusting = (
+        replace(frame, fix_stamp=None if frame.fix_stamp is None else frame.stamp)
+        for frame in frames(motion, latency=latency)
+    )
+    naive = follow(motion, estimator_for(motion), trusting)
+    assert compensated.position_rms < 1.3 * FIX_SIGMA
+    assert compensated.position_rms < naive.position_rms
+
+
+def test_a_carried_away_robot_finds_itself_after_ten_rejected_fixes():
+    motion = recorded("point")
+    away = np.array([3.0, -2.0])
+
+    def carry(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < 1.0 or frame.position_fix is None:
+            return frame
+        return replace(frame, position_fix=frame.position_fix + away)
+
+    estimator = estimator_for(motion)
+    rejected_at_first = None
+    for k, frame in enumerate(frames(motion)):
+        estimate = estimator.update(carry(frame))
+        assert estimate is not None
+        if estimator.counts["position_fix_rejected"] == 9:
+            rejected_at_first = np.linalg.norm(estimate.pose[:2] - motion.poses[k, :2])
+    assert rejected_at_first is not None and rejected_at_first < 0.2
+    assert estimator.counts["position_fix_rejected"] == 10
+    assert estimator.counts["position_fix_reinit"] == 1
+    assert np.linalg.norm(estimate.pose[:2] - motion.poses[-1, :2] - away) < 0.1
+
+
+def test_fixes_that_contradict_each_other_do_not_restart_the_position():
+    motion = recorded("point")
+    rng = np.random.default_rng(0)
+
+    def scatter(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < 1.0 or frame.position_fix is None:
+            return frame
+        side = 20.0 * (-1.0) ** round(frame.stamp / 0.1)
+        return replace(frame, position_fix=frame.position_fix + side + rng.standard_normal(2))
+
+    estimator = estimator_for(motion)
+    errors = follow(motion, estimator, frames(motion), scatter)
+    assert estimator.counts["position_fix_rejected"] > 20
+    assert estimator.counts["position_fix_reinit"] == 0
+    assert errors.position.max() < 0.5
+
+
+def test_a_turned_around_robot_finds_its_heading_again():
+    motion = recorded("point")
+    estimator = estimator_for(motion)
+    for frame in list(frames(motion))[:50]:
+        estimator.update(frame)
+    estimator._filter.replace(slice(2, 3), (float(estimator._filter.x[2]) + 2.5,), 1e-4)
+    for k, frame in list(enumerate(frames(motion)))[50:80]:
+        estimate = estimator.update(frame)
+    assert estimate is not None
+    assert abs(math.remainder(estimate.pose[2] - motion.poses[k, 2], 2 * math.pi)) < 0.2
+    assert estimator.counts["magnetometer_reinit"] == 1
+
+
+def test_a_biased_gyro_is_learnt():
+    motion = recorded("point")
+    bias = 0.1
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        return replace(frame, gyro=frame.gyro + [0.0, 0.0, bias])
+
+    estimator = estimator_for(motion, bias_sigma=0.1)
+    errors = follow(motion, estimator, frames(motion), damage)
+    assert float(estimator._filter.x[5]) == pytest.approx(bias, abs=0.05)
+    assert errors.yaw_rms < math.radians(2.0)
+
+
+def test_nothing_is_claimed_before_position_and_heading_are_measured():
+    estimator = Estimator()
+    still = {"accelerometer": np.array([0, 0, 9.81]), "gyro": np.zeros(3), "velocimeter": np.zeros(3)}
+    north = np.array([-0.5, 0.0, 0.0])
+    assert estimator.update(SensorFrame(0.0, **still)) is None
+    assert estimator.update(SensorFrame(0.1, **still, magnetometer=north)) is None
+    assert not estimator.ready
+    estimate = estimator.update(SensorFrame(0.2, **still, position_fix=np.array([1.0, 2.0])))
+    assert estimate is not None and estimator.ready
+    np.testing.assert_allclose(estimate.pose, [1.0, 2.0, math.pi / 2], atol=0.02)
+
+
+def test_between_fixes_the_uncertainty_grows_and_a_long_gap_starts_afresh():
+    motion = recorded("point")
+    estimator = estimator_for(motion)
+    stream = list(frames(motion))
+    known = estimator.update(stream[0])
+    spread = [known.covariance[0, 0]]
+    for frame in stream[1:20]:
+        estimate = estimator.update(SensorFrame(frame.stamp))
+        spread.append(estimate.covariance[0, 0])
+    assert all(later > earlier for earlier, later in zip(spread, spread[1:], strict=False))
+    assert estimator.update(SensorFrame(frame.stamp + 1.5)) is None
+    assert estimator.counts["gap"] == 1
+
+
+numbers = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([math.nan, math.inf, 1e300, -1e300, 0.0]))
+vectors = st.one_of(st.none(), st.lists(numbers, min_size=3, max_size=3).map(np.array))
+random_frames = st.builds(
+    SensorFrame,
+    stamp=st.one_of(st.floats(0.0, 5.0), st.just(math.nan)),
+    accelerometer=vectors,
+    gyro=vectors,
+    magnetometer=vectors,
+    velocimeter=vectors,
+    position_fix=st.one_of(st.none(), st.lists(numbers, min_size=2, max_size=2).map(np.array)),
+    fix_stamp=st.one_of(st.none(), st.floats(0.0, 5.0), st.just(math.nan)),
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(random_frames, max_size=60), st.booleans(), st.booleans())
+def test_no_input_makes_the_state_infinite_or_the_covariance_lopsided(sequence, in_order, tilts):
+    if in_order:
+        sequence = sorted(sequence, key=lambda frame: frame.stamp if math.isfinite(frame.stamp) else 0.0)
+    estimator = Estimator(EstimatorConfig(tilts=tilts))
+    estimator.update(SensorFrame(-0.01, magnetometer=np.array([0.0, -0.5, 0.0]), position_fix=np.zeros(2)))
+    for frame in sequence:
+        estimate = estimator.update(frame)
+        if estimate is None:
+            continue
+        assert np.isfinite(estimate.pose).all() and np.isfinite(estimate.velocity).all()
+        assert -math.pi <= estimate.pose[2] < math.pi
+        assert -1.0 <= estimate.upright <= 1.0
+        np.testing.assert_array_equal(estimate.covariance, estimate.covariance.T)
+        assert np.linalg.eigvalsh(estimate.covariance).min() > -1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gyro_sigma": 0.0}, "gyro_sigma = 0.0"),
+        ({"fix_sigma": math.nan}, "fix_sigma = nan"),
+        ({"gate_probability": 1.0}, "gate_probability = 1.0"),
+        ({"reinit_after": 1}, "reinit_after = 1"),
+        ({"magnetic_field": (0.0, 0.0, -0.5)}, "magnetic_field"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_by_name(change, message):
+    with pytest.raises(ValueError, match=message):
+        EstimatorConfig(**change)
