@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import mujoco
 import numpy as np
 import pytest
@@ -185,6 +186,30 @@ def test_a_rectangle_on_a_map_is_one_box():
     occupancy = empty_map(FIELD)
     occupancy.occupied[10:14, 20:50] = True
     assert_allclose(boxes_of(occupancy), [(-0.25, -1.4, 0.75, 0.1)], atol=1e-12)
+
+
+@pytest.fixture
+def map_world(tmp_path):
+    """A 2 m by 1.5 m room off the origin with a wall in it, as a map_server file."""
+    picture = np.full((30, 40), 254, np.uint8)
+    picture[12:15, :25] = 0
+    cv2.imwrite(str(tmp_path / "room.png"), picture)
+    text = "image: room.png\nresolution: 0.05\norigin: [6, -1, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    (tmp_path / "room.yaml").write_text(text)
+    return parse_world(str(tmp_path / "room.yaml"))
+
+
+def test_walls_of_a_map_file_stand_in_its_scene(map_world):
+    scene = scene_for([map_world, map_world])
+    layout = sample_layout(map_world, 0)
+    occupancy = layout.occupancy(0.0)
+    assert occupancy.occupied.any() and scene.floor_half_size >= 8.0
+    assert_array_equal(covered(*arranged(layout, scene), occupancy.pixel_centers()), occupancy.occupied)
+
+
+def test_a_map_file_shares_its_scene_with_no_other_world(map_world):
+    with pytest.raises(ValueError, match="must be the only world of its scene, got map.*, two-room"):
+        scene_for([map_world, parse_world("two-room")])
 
 
 def test_no_world_makes_no_scene():
