@@ -13,6 +13,11 @@ from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarF
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
 
+ABSURD = 1e6
+"""No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
+MAX_RATE = 100.0
+"""No robot turns faster than this [rad/s]."""
+
 
 @dataclass(frozen=True)
 class EstimatorConfig:
@@ -130,7 +135,7 @@ class Estimator:
         """Take in one frame.
 
         A frame whose stamp is not after the last one is dropped as a whole, a fix whose stamp is not after the last
-        fix alone. Values that are not finite count as missing.
+        fix alone. Values that are not finite or absurdly large count as missing.
 
         Returns:
             The state at the newest stamp; None until position and heading are known.
@@ -182,7 +187,7 @@ class Estimator:
     def _measured_rate(self, gyro: np.ndarray | None) -> tuple[Vector, float]:
         """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
         rate = _vector(gyro, 3)
-        if rate is None:
+        if rate is None or max(map(abs, rate)) > MAX_RATE:
             return self._rate, 1.0
         jump = math.dist(rate, self._rate)
         # One reading far off is a spike; three in a row are the truth.
@@ -320,12 +325,15 @@ class Estimator:
 
 
 def _vector(value: np.ndarray | None, size: int) -> tuple[float, ...] | None:
-    """The finite components of a measurement as floats; None if it is missing, misshapen or not finite."""
+    """The components of a measurement as floats; None if it is missing, misshapen, not finite or absurd."""
     if value is None:
         return None
     values = np.asarray(value, dtype=np.float64).ravel().tolist()
-    if len(values) != size or not all(map(math.isfinite, values)):
+    if len(values) != size:
         return None
+    for component in values:
+        if not -ABSURD < component < ABSURD:
+            return None
     return tuple(values)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from runtime_motion import FIX_SIGMA, SIGMA, estimator_for, follow, frames, recorded
 
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
-from runtime_motion import FIX_SIGMA, SIGMA, estimator_for, follow, frames, recorded
 
 ROBOTS = ("point", "car", "doggo")
 
