@@ -87,7 +87,7 @@ def _draw_field(axes: Axes, layout: Layout) -> dict[str, Artist]:
     border = Rectangle((xmin, ymin), xmax - xmin, ymax - ymin, fill=False, edgecolor=EDGE, linewidth=1.6, zorder=6)
     border.set_clip_on(False)
     axes.add_patch(border)
-    solid = {"facecolor": OBSTACLE, "edgecolor": EDGE, "linewidth": 0.8}
+    solid: dict[str, Any] = {"facecolor": OBSTACLE, "edgecolor": EDGE, "linewidth": 0.8}
     if layout.base_map is not None:
         occupied = np.ma.masked_equal(layout.base_map.occupied, False)
         axes.imshow(
@@ -123,7 +123,8 @@ def _draw_task(axes: Axes, layout: Layout) -> dict[str, Artist]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    x, y, yaw = layout.start
+    x, y, yaw = layout.start.tolist()
+    goal_x, goal_y = layout.goal.tolist()
     length = max(ARROW_LENGTH, 0.1 * max(layout.half_size))
     axes.annotate(
         "",
@@ -139,9 +140,9 @@ def _draw_task(axes: Axes, layout: Layout) -> dict[str, Artist]:
         zorder=5,
     )
     axes.plot(x, y, "o", color=START, markersize=7, markeredgecolor="white", markeredgewidth=1.0, zorder=5.1)
-    axes.add_patch(Circle(layout.goal, GOAL_RADIUS, facecolor=GOAL, alpha=0.22, edgecolor="none", zorder=1.5))
-    axes.add_patch(Circle(layout.goal, GOAL_RADIUS, fill=False, edgecolor=GOAL, linewidth=1.2, zorder=4))
-    axes.plot(*layout.goal, "*", color=GOAL, markersize=13, markeredgecolor="white", markeredgewidth=0.8, zorder=5)
+    axes.add_patch(Circle((goal_x, goal_y), GOAL_RADIUS, facecolor=GOAL, alpha=0.22, edgecolor="none", zorder=1.5))
+    axes.add_patch(Circle((goal_x, goal_y), GOAL_RADIUS, fill=False, edgecolor=GOAL, linewidth=1.2, zorder=4))
+    axes.plot(goal_x, goal_y, "*", color=GOAL, markersize=13, markeredgecolor="white", markeredgewidth=0.8, zorder=5)
     star = Line2D([], [], linestyle="none", marker="*", color=GOAL, markersize=12, markeredgecolor="white")
     return {"start and heading": _dot(START, "white"), f"goal, reached within {GOAL_RADIUS} m": star}
 
@@ -159,12 +160,18 @@ def _draw_drive(axes: Axes, drive: Mapping[str, Any]) -> dict[str, Artist]:
         entries |= {"driven": axes.plot(*driven.T, color=PATH, linewidth=2.0, solid_capstyle="round", zorder=3)[0]}
     if plans:
         axes.add_collection(LineCollection(plans, colors=PLAN, linewidths=1.1, alpha=0.8, zorder=2.9))
-        dots = {"marker": "o", "markersize": 3.4, "markeredgecolor": "white", "markeredgewidth": 0.4}
+        dots: dict[str, Any] = {"marker": "o", "markersize": 3.4, "markeredgecolor": "white", "markeredgewidth": 0.4}
         axes.plot(*np.concatenate(plans).T, linestyle="none", color=PLAN, zorder=3.2, **dots)
         entries[f"waypoints of {len(plans)} plans"] = Line2D([], [], color=PLAN, linewidth=1.1, **dots)
     if len(collisions):
         label = f"collision ({len(collisions)})"
-        style = {"linestyle": "none", "marker": "X", "color": COLLISION, "markersize": 9, "markeredgecolor": "white"}
+        style: dict[str, Any] = {
+            "linestyle": "none",
+            "marker": "X",
+            "color": COLLISION,
+            "markersize": 9,
+            "markeredgecolor": "white",
+        }
         entries[label] = axes.plot(*collisions.T, zorder=5.5, **style)[0]
     return entries
 

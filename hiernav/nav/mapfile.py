@@ -157,7 +157,7 @@ def _read_png(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape[:2] != shape:
         raise MapFileError(f"{path}: damaged PNG picture, {shape[1]} x {shape[0]} pixels cannot be decoded")
-    image = image.astype(np.float32) / np.iinfo(image.dtype).max
+    image = image.astype(np.float32) / (65535.0 if image.dtype == np.uint16 else 255.0)
     if image.ndim == 2:
         return image
     color = image[..., :3].mean(axis=2) if image.shape[2] >= 3 else image[..., 0]

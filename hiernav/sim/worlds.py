@@ -167,7 +167,7 @@ class _Placed:
         others = self.things
         dx, dy = points[:, 0:1] - others[:, 0], points[:, 1:2] - others[:, 1]
         separation = keep_out + others[:, 2]
-        free = (dx * dx + dy * dy >= separation * separation).all(axis=1)
+        free = np.all(dx * dx + dy * dy >= separation * separation, axis=1)
         choice = int(free.argmax())
         return (float(points[choice, 0]), float(points[choice, 1])) if free[choice] else None
 
