@@ -92,6 +92,7 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Annotated[float, Meta(gt=0, le=1)] | None,
         Meta(description="Stop once an evaluation reaches this rate; null: never."),
     ] = None
+    layer_norm: Annotated[bool, Meta(description="Layer normalisation in the critics.")] = False
     compile: Annotated[bool, Meta(description="Compile the update with torch.compile.")] = False
 
 

@@ -96,6 +96,10 @@ class NavigationTask:
         """(N, 3) true pose, world frame [m, m, rad]."""
         return self.sim.pose
 
+    def draw_from(self, layouts: LayoutSource) -> None:
+        """Draw the layouts of future episodes from another source."""
+        self._draw = layouts
+
     def reset(self, rows: np.ndarray | None = None, layouts: Sequence[Layout] | None = None) -> np.ndarray:
         """Start new episodes in some rows (all by default), in drawn or given layouts.
 

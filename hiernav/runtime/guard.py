@@ -1,0 +1,128 @@
+"""The last thing an action passes before the robot. It is always on: there is no switch to disable it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class GuardConfig:
+    """Limits of what may reach the robot."""
+
+    low: float = -1.0
+    """Smallest command of an actuator."""
+    high: float = 1.0
+    """Largest command of an actuator."""
+    slew_limit: float | None = None
+    """Largest change of a command from one tick to the next; None where a policy was trained without it."""
+    max_non_finite: int = 3
+    """Actions with NaN or inf in a row that are a fault; a single one brakes for its tick."""
+    tilt_limit: float | None = None
+    """Angle of the body's z axis to the vertical that is a fault [rad]; None for a robot that cannot tilt."""
+    max_tilted: int = 3
+    """Ticks in a row beyond the tilt limit that are a fault."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= 0.0 <= self.high):
+            raise ValueError(f"GuardConfig: limits {self.low} to {self.high} must be finite and include 0, the brake")
+        if self.slew_limit is not None and not 0.0 < self.slew_limit < math.inf:
+            raise ValueError(f"GuardConfig.slew_limit = {self.slew_limit} must be finite and positive, or None")
+        if self.tilt_limit is not None and not 0.0 < self.tilt_limit <= math.pi:
+            raise ValueError(f"GuardConfig.tilt_limit = {self.tilt_limit} rad must be in (0, pi], or None")
+        for name in ("max_non_finite", "max_tilted"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be at least 1")
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """What may be sent to the robot."""
+
+    action: np.ndarray
+    """(A,) float64, finite and within the limits; zeros are the brake."""
+    fault: str | None = None
+    """Why the run must end, or None."""
+
+
+class Guard:
+    """Lets through what is finite, within limits and commanded by a robot that stands."""
+
+    def __init__(self, action_dim: int, config: GuardConfig | None = None) -> None:
+        """
+        Raises:
+            ValueError: `action_dim` is below 1.
+        """
+        if action_dim < 1:
+            raise ValueError(f"Guard: action_dim {action_dim} must be at least 1")
+        self.action_dim = action_dim
+        self.config = config or GuardConfig()
+        self.counts: Counter[str] = Counter()
+        """How often it acted: non_finite, clipped, slewed, tilted."""
+        limit = self.config.tilt_limit
+        self._least_upright = -math.inf if limit is None else math.cos(limit)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new run begins from standstill; counts are kept."""
+        self._last = np.zeros(self.action_dim)
+        self._non_finite = 0
+        self._tilted = 0
+
+    def check(self, action: np.ndarray, upright: float | None = None) -> Guarded:
+        """Make `action` safe to send.
+
+        Args:
+            action: (A,) from the policy, possibly garbage.
+            upright: z component of the body's z axis; None where it is not known. NaN counts as fallen.
+        """
+        fault = self._tilt_fault(upright)
+        if fault is not None:
+            return Guarded(self._brake(), fault)
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.action_dim,):
+            return Guarded(self._brake(), f"action has shape {action.shape}, the robot takes ({self.action_dim},)")
+        if not np.isfinite(action).all():
+            return self._refuse(action)
+        self._non_finite = 0
+        limited = np.clip(action, self.config.low, self.config.high)
+        if (limited != action).any():
+            self.counts["clipped"] += 1
+        slew = self.config.slew_limit
+        if slew is not None:
+            steady = np.clip(limited, self._last - slew, self._last + slew)
+            if (steady != limited).any():
+                self.counts["slewed"] += 1
+            limited = steady
+        self._last = limited
+        return Guarded(limited)
+
+    def _refuse(self, action: np.ndarray) -> Guarded:
+        self.counts["non_finite"] += 1
+        self._non_finite += 1
+        fault = None
+        if self._non_finite >= self.config.max_non_finite:
+            channel = int(np.flatnonzero(~np.isfinite(action))[0])
+            fault = f"action not finite {self._non_finite} times in a row, first in channel {channel}"
+        return Guarded(self._brake(), fault)
+
+    def _tilt_fault(self, upright: float | None) -> str | None:
+        if upright is None or upright >= self._least_upright:
+            self._tilted = 0
+            return None
+        if self.config.tilt_limit is None:
+            return None
+        self.counts["tilted"] += 1
+        self._tilted += 1
+        if self._tilted < self.config.max_tilted:
+            return None
+        angle = math.degrees(math.acos(min(max(upright, -1.0), 1.0))) if math.isfinite(upright) else math.nan
+        return f"tilted by {angle:.0f} degrees, the limit is {math.degrees(self.config.tilt_limit):.0f}"
+
+    def _brake(self) -> np.ndarray:
+        # The stop is not slewed; what follows it starts from zero again.
+        self._last = np.zeros(self.action_dim)
+        return self._last

@@ -1,0 +1,230 @@
+"""A simulated robot behind the interface of a real one: noisy sensors, late fixes, and a watchdog of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hiernav.nav.lidar import lidar_closeness
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.runtime.clock import Clock
+from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame
+from hiernav.sim.batch import BatchSim
+from hiernav.sim.robots import RobotSpec
+from hiernav.sim.scene import SceneSpec, scene_for
+from hiernav.sim.worlds import Layout
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Errors of the simulated sensors: standard deviations per component, rates, delays and losses."""
+
+    accelerometer: float = 0.1
+    """[m/s^2]"""
+    gyro: float = 0.02
+    """[rad/s]"""
+    magnetometer: float = 0.01
+    """In units of the field, which is 0.5."""
+    velocimeter: float = 0.02
+    """[m/s]"""
+    extra: float = 0.0
+    """Of the robot's own terms, in their units."""
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[rad/s]"""
+    fix: float = 0.02
+    """[m]"""
+    fix_period: float = 0.1
+    """Time between position fixes [s]; never shorter than the control period."""
+    fix_latency: float = 0.0
+    """Time from measurement to delivery of a fix [s]."""
+    dropout: float = 0.0
+    """Probability that a sensor gives nothing in a tick, for each inertial sensor by itself."""
+    fix_dropout: float = 0.0
+    """Probability that a fix is lost."""
+
+    def __post_init__(self) -> None:
+        for name in ("accelerometer", "gyro", "magnetometer", "velocimeter", "extra", "fix", "fix_latency"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"SensorNoise.{name} = {value} must be finite and not negative")
+        for name in ("dropout", "fix_dropout"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"SensorNoise.{name} = {getattr(self, name)} must be a probability")
+        if not 0.0 < self.fix_period < math.inf:
+            raise ValueError(f"SensorNoise.fix_period = {self.fix_period} s must be finite and positive")
+
+
+EXACT = SensorNoise(accelerometer=0.0, gyro=0.0, magnetometer=0.0, velocimeter=0.0, fix=0.0)
+"""Sensors without errors; the fix still comes at its own rate."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What really happened. For the recorder and the summary alone; nothing that drives may see it."""
+
+    time: float
+    """Since the reset [s]."""
+    pose: np.ndarray
+    """(3,) x, y, yaw; world frame [m, m, rad]."""
+    velocity: np.ndarray
+    """(2,) world frame [m/s]."""
+    upright: float
+    collided: bool
+    """Contact with an obstacle in the last control step."""
+    collisions: int
+    """Control steps with contact since the reset."""
+
+
+class SimRobot:
+    """One simulated robot in one layout. Each command lets one control period pass.
+
+    Given a clock, it lives in that clock's time: periods in which no command came pass as well, under the last
+    command until that is too old, then braked.
+    """
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        layout: Layout,
+        noise: SensorNoise | None = None,
+        seed: int = 0,
+        clock: Clock | None = None,
+        scene: SceneSpec | None = None,
+    ) -> None:
+        """
+        Args:
+            robot: what to simulate.
+            layout: where; also start pose and obstacles.
+            noise: of the sensors.
+            seed: of the noise.
+            clock: time to live in; None lets time pass with commands only.
+            scene: obstacle slots, where layouts of several worlds will follow; by default those of `layout`'s world.
+        """
+        self.spec = robot
+        self.noise = noise or SensorNoise()
+        self.watchdog = CommandWatchdog(robot.control_period)
+        self._clock = clock
+        self._sim = BatchSim(robot, 1, scene or scene_for([layout.spec]))
+        self.reset(layout, seed)
+
+    @property
+    def control_period(self) -> float:
+        return self.spec.control_period
+
+    @property
+    def action_dim(self) -> int:
+        return self.spec.action_dim
+
+    def reset(self, layout: Layout, seed: int = 0) -> None:
+        """Start anew in `layout`, with the noise of `seed`."""
+        self.layout = layout
+        self._rng = np.random.default_rng(np.random.SeedSequence([seed, 0x5E4503]))
+        self._sim.reset(np.array([0]), [layout])
+        self._collisions = 0
+        self._held = np.zeros(self.action_dim)
+        self._advanced_at: float | None = None
+        self._pending: deque[tuple[float, float, np.ndarray]] = deque()
+        self._next_fix = 0.0
+        self._frame: SensorFrame | None = None
+
+    def read(self) -> SensorFrame:
+        self._catch_up()
+        if self._frame is None:
+            self._frame = self._sense()
+        return self._frame
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        """Apply `action` (A,), clipped to [-1, 1], for one control period.
+
+        Raises:
+            ValueError: wrong shape, or not finite.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.action_dim,):
+            raise ValueError(f"SimRobot.send: action has shape {action.shape}, expected ({self.action_dim},)")
+        if not np.isfinite(action).all():
+            raise ValueError(f"SimRobot.send: action {action.tolist()} is not finite")
+        sent = np.clip(action, -1.0, 1.0)
+        if self._clock is not None:
+            self._advanced_at = self._clock.now()
+            self.watchdog.feed(self._advanced_at)
+        self._step(sent)
+        return sent
+
+    def brake(self) -> None:
+        """All actuators off for one control period."""
+        self.send(np.zeros(self.action_dim))
+
+    def close(self) -> None:
+        self._sim.close()
+
+    def truth(self) -> Truth:
+        sim = self._sim
+        return Truth(
+            time=float(sim.time[0]),
+            pose=sim.pose[0],
+            velocity=sim.velocity[0],
+            upright=float(sim.upright[0]),
+            collided=bool(sim.collided[0]),
+            collisions=self._collisions,
+        )
+
+    def occupancy(self, stamp: float) -> OccupancyMap:
+        """The known map, with moving obstacles where they are at `stamp` [s]."""
+        return self.layout.occupancy(stamp)
+
+    def _step(self, action: np.ndarray) -> None:
+        self._held = action
+        self._sim.step(action[None])
+        self._collisions += int(self._sim.collided[0])
+        self._frame = None
+
+    def _catch_up(self) -> None:
+        """Let the periods pass in which no command came."""
+        if self._clock is None or self._advanced_at is None:
+            return
+        now, period = self._clock.now(), self.control_period
+        # Half a period of tolerance: a command that is merely late is not a missed one.
+        for _ in range(int((now - self._advanced_at) / period - 0.5)):
+            self._advanced_at += period
+            self._step(np.zeros(self.action_dim) if self.watchdog.expired(self._advanced_at) else self._held)
+
+    def _sense(self) -> SensorFrame:
+        sim, noise = self._sim, self.noise
+        now = float(sim.time[0])
+        readings: dict[str, np.ndarray | None] = {}
+        for name in VECTOR_SENSORS:
+            value = sim.sensors[name][0] + getattr(noise, name) * self._rng.standard_normal(3)
+            lost = self._rng.random() < noise.dropout
+            readings[name] = None if lost else value
+        if readings["gyro"] is not None:
+            readings["gyro"] = readings["gyro"] + noise.gyro_bias
+        extra = {
+            name: sim.sensors[name][0] + noise.extra * self._rng.standard_normal(size)
+            for name, size in self.spec.extra_terms.items()
+        }
+        fix, fix_stamp = self._sense_position(now)
+        return SensorFrame(
+            stamp=now,
+            **readings,
+            lidar=lidar_closeness(sim.pose, self.layout.obstacle_points(now)[None])[0],
+            extra=extra,
+            position_fix=fix,
+            fix_stamp=fix_stamp,
+        )
+
+    def _sense_position(self, now: float) -> tuple[np.ndarray | None, float | None]:
+        noise = self.noise
+        if now >= self._next_fix - 1e-9:
+            missed = math.floor((now - self._next_fix) / noise.fix_period + 1e-6)
+            self._next_fix += (missed + 1) * noise.fix_period
+            measured = self._sim.pose[0, :2] + noise.fix * self._rng.standard_normal(2)
+            if self._rng.random() >= noise.fix_dropout:
+                self._pending.append((now + noise.fix_latency, now, measured))
+        if self._pending and self._pending[0][0] <= now + 1e-9:
+            _, stamp, fix = self._pending.popleft()
+            return fix, stamp
+        return None, None

@@ -1,0 +1,64 @@
+"""Replay buffer on disk: a torchrl ReplayBuffer over memory-mapped files, so that a checkpoint need not copy it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import ReplayBuffer, TensorStorage
+
+KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
+
+
+class Replay:
+    """Transitions of one run.
+
+    Entries before the cursor of a checkpoint are on disk when it is written. What a crashed run wrote after it is
+    overwritten by the resumed one. (Once the buffer has wrapped, such entries can be sampled before they are
+    overwritten; a run is only reproduced to the bit while `total_steps <= buffer_size`.)
+    """
+
+    def __init__(self, folder: Path, size: int, observation: int, action: int, batch_size: int) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "meta.json").exists():
+            self._data = TensorDict.load_memmap(folder)
+        else:
+            example = TensorDict(
+                {
+                    "observation": torch.zeros(observation),
+                    "action": torch.zeros(action),
+                    "next": {
+                        "observation": torch.zeros(observation),
+                        "reward": torch.zeros(1),
+                        "done": torch.zeros(1, dtype=torch.bool),
+                        "terminated": torch.zeros(1, dtype=torch.bool),
+                    },
+                }
+            )
+            self._data = example.expand(size).memmap_like(folder)
+        self._storage = TensorStorage(self._data)
+        self._buffer = ReplayBuffer(storage=self._storage, batch_size=batch_size)
+        self._set(0, 0)
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def extend(self, transitions: TensorDict) -> None:
+        """Append transitions (M,)."""
+        self._buffer.extend(transitions.select(*KEYS))
+
+    def sample(self) -> TensorDict:
+        """A random batch (B,)."""
+        return self._buffer.sample()
+
+    def state_dict(self) -> dict[str, int]:
+        return {"cursor": int(self._buffer.writer.state_dict()["_cursor"]), "length": len(self)}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self._set(state["cursor"], state["length"])
+
+    def _set(self, cursor: int, length: int) -> None:
+        # the files are the storage: only how much of them is valid has to be told
+        self._storage._len = length
+        self._buffer.writer.load_state_dict({"_cursor": cursor, "_write_count": length})

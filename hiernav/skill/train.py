@@ -1,0 +1,294 @@
+"""Training of the skill: torchrl's collector, a replay buffer on disk, and the learner.
+
+The run is cut into segments of `checkpoint_every_steps`. Each one starts from freshly drawn episodes and ends with a
+checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+
+from hiernav.config import TrainConfig
+from hiernav.nav.observation import ObservationLayout, observation_layout
+from hiernav.nav.option import Planner, TerminationReason
+from hiernav.run import Run, RunError
+from hiernav.sim.factory import RandomLayouts, make_task
+from hiernav.sim.layout import parse_world
+from hiernav.sim.reward import TERMS
+from hiernav.sim.robots import get_robot
+from hiernav.sim.rollout import run_episodes
+from hiernav.sim.worlds import sample_layout
+from hiernav.skill.env import NavigationEnv
+from hiernav.skill.networks import Actor
+from hiernav.skill.replay import Replay
+from hiernav.skill.sac import Learner, SacSettings
+
+_WINDOW = 200
+"""Episodes that running means are taken over."""
+_EVALUATION_SEED = 0xE7A1
+_BATCH_FRAMES = 128
+"""Steps collected between two bursts of updates, at least one per simulation."""
+_LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
+
+
+class TrainingDiverged(RuntimeError):
+    """Losses are no longer finite; the last checkpoint is from before."""
+
+
+@dataclass
+class Progress:
+    """What a progress display may want to show."""
+
+    steps: int
+    total_steps: int
+    updates: int
+    steps_per_second: float
+    reach_rate: float
+    evaluation: float | None
+
+
+@dataclass
+class _Episodes:
+    """Running statistics of the episodes that ended lately."""
+
+    reached: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+    steps: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+
+    def add(self, data: TensorDict) -> None:
+        ended = data["next", "done"].squeeze(-1)
+        self.reached.extend(data["next", "reached"].squeeze(-1)[ended].float().tolist())
+        self.steps.extend(data["next", "episode_steps"].squeeze(-1)[ended].float().tolist())
+
+    @property
+    def reach_rate(self) -> float:
+        return float(np.mean(self.reached)) if self.reached else float("nan")
+
+
+def skill_layout(config: TrainConfig) -> ObservationLayout:
+    """Observation layout of a configuration's skill."""
+    return observation_layout(config.robot, "goal" if config.skill.preset == "baseline" else "waypoints")
+
+
+def make_learner(config: TrainConfig) -> Learner:
+    """An untrained learner for a configuration."""
+    skill = config.skill
+    settings = SacSettings(
+        hidden=skill.hidden,
+        discount=skill.discount,
+        tau=skill.tau,
+        learning_rate=skill.learning_rate,
+        init_alpha=skill.init_alpha,
+        alpha_floor=skill.alpha_floor,
+        target_entropy=skill.target_entropy,
+        layer_norm=skill.layer_norm,
+        compile=skill.compile,
+    )
+    return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings)
+
+
+class TorchSkill:
+    """The learner's deterministic policy as a `Skill`: observations (N, D) -> actions (N, A), numpy in and out."""
+
+    def __init__(self, actor: torch.nn.Module) -> None:
+        self.actor = actor
+
+    @torch.no_grad()
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return self.actor.mean_action(torch.from_numpy(observation)).numpy()
+
+
+class SkillTrainer:
+    """One training of the skill within a run folder."""
+
+    def __init__(self, config: TrainConfig, run: Run, planner: Planner | None = None) -> None:
+        self.config, self.run, self.planner = config, run, planner
+        skill = config.skill
+        seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
+        torch.manual_seed(int(seeds[0]))
+        self.learner = make_learner(config)
+        self.task = make_task(config, skill.num_envs, planner)
+        self.env = NavigationEnv(self.task)
+        self.replay = Replay(
+            run.path / "skill" / "replay",
+            min(skill.buffer_size, skill.total_steps + skill.num_envs),
+            self.task.layout.size,
+            self.task.robot.action_dim,
+            skill.batch_size,
+        )
+        self.steps = 0
+        self.evaluations: list[dict[str, float]] = []
+        self.best_actor: dict[str, torch.Tensor] | None = None
+        self._due = 0.0
+        self._episodes = _Episodes()
+
+    def resume(self) -> int | None:
+        """Go back to the last checkpoint; its number of steps, or None if there is none."""
+        state = self.run.load("skill", rewind=True)
+        if state is None:
+            return None
+        self.learner.load_state_dict(state["learner"])
+        self.replay.load_state_dict(state["replay"])
+        torch.set_rng_state(state["torch_rng"])
+        self.steps, self._due = state["steps"], state["due"]
+        self.evaluations, self.best_actor = state["evaluations"], state["best_actor"]
+        self._episodes.reached.extend(state["reached"])
+        self._episodes.steps.extend(state["episode_steps"])
+        return self.steps
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are done, or an evaluation reached the rate to stop at."""
+        skill = self.config.skill
+        enough = skill.stop_reach_rate is not None and any(
+            evaluation["reach_rate"] >= skill.stop_reach_rate for evaluation in self.evaluations
+        )
+        return enough or self.steps >= skill.total_steps
+
+    def train(self, on_progress: Callable[[Progress], None] | None = None) -> None:
+        """Train to the end, checkpointing on the way.
+
+        Raises:
+            TrainingDiverged: a loss is not finite.
+        """
+        while not self.finished:
+            self._segment(on_progress)
+            if self.steps >= self._next_evaluation() or self.steps >= self.config.skill.total_steps:
+                self._evaluate()
+            self._save()
+        shutil.rmtree(self.run.path / "skill" / "replay", ignore_errors=True)
+
+    def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
+        skill, began, first = self.config.skill, time.perf_counter(), self.steps
+        number = self.steps // skill.checkpoint_every_steps
+        self.task.draw_from(
+            RandomLayouts([parse_world(skill.world)], (self.config.seed, 2, number), self.task.robot.radius)
+        )
+        frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
+        per_batch = skill.num_envs * max(1, min(_BATCH_FRAMES // skill.num_envs, frames // skill.num_envs))
+        collector = Collector(
+            self.env,
+            self.learner.policy,
+            frames_per_batch=per_batch,
+            total_frames=max(1, frames // per_batch) * per_batch,
+            init_random_frames=max(0, skill.learning_starts - self.steps),
+        )
+        window: list[TensorDict] = []
+        try:
+            for data in collector:
+                data = data.reshape(-1)
+                data["next", "reward"] *= skill.reward_scale
+                self._episodes.add(data)
+                window.append(data.select(*_LOGGED))
+                self.replay.extend(data)
+                self.steps += len(data)
+                metrics = self._update(len(data))
+                if on_progress is not None:
+                    rate = (self.steps - first) / (time.perf_counter() - began)
+                    evaluation = self.evaluations[-1]["reach_rate"] if self.evaluations else None
+                    on_progress(
+                        Progress(
+                            self.steps, skill.total_steps, self.learner.updates, rate, self._episodes.reach_rate,
+                            evaluation,
+                        )  # fmt: skip
+                    )
+        finally:
+            collector.shutdown(close_env=False)
+        # rates are not logged with the metrics: these are the same for the same seed
+        self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
+
+    def _update(self, frames: int) -> dict[str, float]:
+        skill = self.config.skill
+        if self.steps <= skill.learning_starts or len(self.replay) < skill.batch_size:
+            return {}
+        self._due += frames * skill.updates_per_step
+        metrics: dict[str, torch.Tensor] = {}
+        while self._due >= 1.0:
+            metrics = self.learner.update(self.replay.sample())
+            self._due -= 1.0
+        values = {key: float(value) for key, value in metrics.items()}
+        broken = [key for key, value in values.items() if not np.isfinite(value)]
+        if broken:
+            raise TrainingDiverged(
+                f"{', '.join(broken)} not finite after {self.learner.updates} updates; "
+                f"the last checkpoint in {self.run.path} is from before"
+            )
+        return values
+
+    def _statistics(self, data: TensorDict) -> dict[str, float]:
+        terms = data["next", "terms"].mean(0).tolist()
+        reasons = torch.bincount(data["next", "reason"].reshape(-1).long(), minlength=len(TerminationReason))
+        return {
+            "reach_rate": self._episodes.reach_rate,
+            "episode_steps": float(np.mean(self._episodes.steps)) if self._episodes.steps else float("nan"),
+            "collisions_per_step": float(data["next", "collided"].float().mean()),
+            "updates": self.learner.updates,
+            **{f"reward/{name}": value for name, value in zip(TERMS, terms, strict=True)},
+            **{f"replans/{r.name.lower()}": float(reasons[r] / reasons.sum()) for r in TerminationReason if r},
+        }
+
+    def _next_evaluation(self) -> float:
+        every = self.config.skill.eval_every_steps
+        done = self.evaluations[-1]["step"] if self.evaluations else 0
+        return (done // every + 1) * every
+
+    def _evaluate(self) -> None:
+        """Reach rate of the deterministic policy on worlds that are never trained on; keeps the best actor."""
+        skill = self.config.skill
+        radius = self.task.robot.radius
+        seeds = np.random.SeedSequence((self.config.seed, _EVALUATION_SEED)).generate_state(skill.eval_episodes)
+        layouts = [sample_layout(parse_world(skill.world), int(seed), radius) for seed in seeds]
+        task = make_task(self.config, min(64, skill.eval_episodes), self.planner)
+        episodes = run_episodes(task, TorchSkill(self.learner.actor), layouts)
+        result = {
+            "step": self.steps,
+            "reach_rate": float(np.mean([e.reached for e in episodes])),
+            "steps_mean": float(np.mean([e.steps_counted for e in episodes])),
+            "collisions_mean": float(np.mean([e.collisions for e in episodes])),
+            "return_mean": float(np.mean([e.return_ for e in episodes])),
+        }
+
+        def merit(evaluation: dict[str, float]) -> tuple[float, float]:
+            return evaluation["reach_rate"] - 0.01 * evaluation["collisions_mean"], -evaluation["steps_mean"]
+
+        if all(merit(result) >= merit(earlier) for earlier in self.evaluations):
+            self.best_actor = {key: value.clone() for key, value in self.learner.actor.state_dict().items()}
+        self.evaluations.append(result)
+        self.run.log("evaluation", self.steps, {k: v for k, v in result.items() if k != "step"})
+
+    def _save(self) -> None:
+        self.run.save(
+            "skill",
+            {
+                "learner": self.learner.state_dict(),
+                "replay": self.replay.state_dict(),
+                "torch_rng": torch.get_rng_state(),
+                "steps": self.steps,
+                "due": self._due,
+                "evaluations": self.evaluations,
+                "best_actor": self.best_actor,
+                "reached": list(self._episodes.reached),
+                "episode_steps": list(self._episodes.steps),
+            },
+        )
+
+
+def load_actor(config: TrainConfig, state: dict) -> Actor:
+    """The best actor of a skill checkpoint.
+
+    Raises:
+        RunError: the checkpoint is from before the first evaluation.
+    """
+    if state["best_actor"] is None:
+        raise RunError("the skill has not been evaluated yet: train for longer")
+    actor = Actor(skill_layout(config), get_robot(config.robot).action_dim, config.skill.hidden, layer_norm=False)
+    actor.load_state_dict(state["best_actor"])
+    return actor.eval()
