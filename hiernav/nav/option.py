@@ -263,8 +263,8 @@ class WaypointOption:
         self.plan[rows[accepted]] = plan[accepted]
         self.start[rows[accepted]] = position[accepted]
         self.started[rows[good]] = True
-        self.age[rows] = 0
-        for row in rows.tolist():
+        self.age[rows[accepted]] = 0
+        for row in rows[accepted].tolist():
             self._swept[row] = None
 
 

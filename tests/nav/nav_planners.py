@@ -1,0 +1,51 @@
+"""Planners with known answers, for tests of what is done with a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hiernav.nav.occupancy import OccupancyMap, VisitMap, draw_discs, empty_map
+from hiernav.nav.option import PlanQuery
+
+
+@dataclass
+class StraightPlanner:
+    """Goes straight at the goal, ten waypoints 0.1 m apart, padded with the goal; rows in `silent` find nothing."""
+
+    silent: bool = False
+    queries: list[PlanQuery] = field(default_factory=list)
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        self.queries.append(query)
+        delta = query.goal - query.position
+        length = np.maximum(np.linalg.norm(delta, axis=-1), 1e-9)[:, None, None]
+        along = np.minimum(0.1 * np.arange(1, 11)[None, :, None], length)
+        plans = query.position[:, None] + along * delta[:, None] / length
+        return np.full_like(plans, np.nan) if self.silent else plans
+
+
+def map_with_pillars(
+    centers: Sequence[Sequence[float]] = (), half_size: tuple[float, float] = (3.0, 3.0), radius: float = 0.2
+) -> OccupancyMap:
+    """A free map with discs drawn into it [m]."""
+    field_ = empty_map(half_size)
+    draw_discs(
+        field_.occupied, field_.origin, field_.resolution, np.reshape(np.asarray(centers, float), (-1, 2)), radius
+    )
+    return field_
+
+
+def query_of(
+    position: Sequence[Sequence[float]],
+    goal: Sequence[Sequence[float]],
+    occupancy: OccupancyMap,
+    previous: np.ndarray | None = None,
+) -> PlanQuery:
+    """A query for M robots on one map."""
+    where = np.asarray(position, float)
+    previous = np.full((len(where), 10, 2), np.nan) if previous is None else previous
+    visits = [VisitMap(occupancy) for _ in where]
+    return PlanQuery(where, np.asarray(goal, float), [occupancy] * len(where), visits, previous)

@@ -1,0 +1,48 @@
+"""The agent: what the skill sees of the plan, and what it answers, at each step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from nav_planners import StraightPlanner, map_with_pillars
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hiernav.nav.frames import body_to_world
+from hiernav.nav.observation import observation_layout
+from hiernav.nav.option import HierarchicalAgent, TerminationReason, WaypointOption
+
+NONE, START = TerminationReason.NONE, TerminationReason.START
+FREE = map_with_pillars()
+FAR = (2.5, 0.0)
+
+
+@pytest.mark.parametrize("guidance", ["waypoints", "goal"])
+def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guidance: str) -> None:
+    layout = observation_layout("point", guidance)
+    sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: np.tanh(o[:, :2]), layout)
+    goal = np.array([[2.0, 0.0], [0.0, 2.0]])
+    poses = [
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        [[0.1, 0.02, 0.7], [0.03, 0.1, -2.0]],
+        [[0.2, 0.0, 3.0], [0.0, 0.2, 1.5]],
+    ]
+    for tick, pose in enumerate(np.asarray(poses)):
+        step = agent.act(pose, sensors, goal, [FREE] * 2)
+        assert step.replanned.tolist() == [tick == 0] * 2
+        seen = step.observation[:, layout.slices[guidance]].astype(float).reshape(2, -1, 2)
+        expected = step.plan if guidance == "waypoints" else goal[:, None]
+        assert_allclose(body_to_world(seen, pose), expected, atol=1e-6)
+        assert_allclose(step.plan[:, 4], [[0.5, 0.0], [0.0, 0.5]], atol=1e-12)
+        assert_array_equal(step.action, np.tanh(step.observation[:, :2]))
+
+
+def test_an_agent_that_is_reset_plans_again() -> None:
+    layout = observation_layout("point")
+    sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms}
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 1), lambda o: o[:, :2], layout)
+    reasons = []
+    for _ in range(2):
+        reasons += [int(agent.act(np.zeros((1, 3)), sensors, np.array([FAR]), [FREE]).reason[0]) for _ in range(2)]
+        agent.reset()
+    assert reasons == [START, NONE, START, NONE]

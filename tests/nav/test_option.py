@@ -1,0 +1,288 @@
+"""A plan ends when it should, for the reason that is recorded, and only for the robots concerned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nav_planners import StraightPlanner, map_with_pillars
+from numpy.testing import assert_allclose, assert_array_equal
+
+from hiernav.nav.option import ReplanRule, TerminationReason, WaypointOption
+from hiernav.nav.path import nearest_vertex, polyline
+
+NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL = TerminationReason
+FREE = map_with_pillars()
+FAR = (2.5, 0.0)
+DEFAULT = ReplanRule()
+
+
+class Drive:
+    """An option and the robots under it; every call of `at` is one control step."""
+
+    def __init__(self, num_rows: int = 1, rule: ReplanRule = DEFAULT, goal: object = FAR) -> None:
+        self.planner = StraightPlanner()
+        self.option = WaypointOption(self.planner, num_rows, rule)
+        self.goal = np.broadcast_to(np.asarray(goal, float), (num_rows, 2)).copy()
+        self.map = FREE
+
+    def at(self, *positions: object) -> list[TerminationReason]:
+        step = self.option.step(np.asarray(positions, float), self.goal, [self.map] * len(positions))
+        return [TerminationReason(reason) for reason in step.reason]
+
+
+def test_the_first_step_plans_and_following_the_plan_replans_after_half_of_it() -> None:
+    drive = Drive()
+    reasons = {x: drive.at((x, 0.0))[0] for x in np.round(np.arange(0.0, 0.65, 0.05), 2).tolist()}
+    assert reasons.pop(0.0) == START
+    # the sixth of ten waypoints becomes the closest one beyond 0.55 m
+    assert reasons.pop(0.6) == HALF_INDEX
+    assert set(reasons.values()) == {NONE}
+    assert_allclose(drive.option.plan[0, 0], [0.7, 0.0])
+    assert_allclose(drive.option.start[0], [0.6, 0.0])
+
+
+def test_leaving_the_plan_replans_from_where_the_robot_is() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    assert drive.at((0.2, 0.299)) == [NONE]
+    assert drive.at((0.2, 0.301)) == [D_UPDATE]
+    assert_allclose(drive.option.line()[0, 0], [0.2, 0.301])
+
+
+def test_the_position_a_plan_was_made_from_is_part_of_it() -> None:
+    """Backing off counts from the start, not from the first waypoint."""
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    assert drive.at((-0.299, 0.0)) == [NONE]
+    assert drive.at((-0.301, 0.0)) == [D_UPDATE]
+
+
+def test_a_plan_to_a_goal_nearer_than_its_length_is_driven_to_the_goal() -> None:
+    """All waypoints beyond the goal lie on it, so the index stops there and the goal ends the plan."""
+    drive = Drive(goal=(0.5, 0.0))
+    assert drive.at((0.0, 0.0)) == [START]
+    assert_allclose(drive.option.plan[0, 4:], np.broadcast_to([0.5, 0.0], (6, 2)))
+    assert drive.at((0.19, 0.0)) == [NONE]
+    assert drive.at((0.21, 0.0)) == [GOAL]
+    assert len(drive.planner.queries) == 1
+
+
+def test_a_plan_within_0_2_m_ends_by_distance_alone() -> None:
+    drive = Drive(goal=(0.2, 0.0))
+    drive.option.goal_radius = 0.01
+    assert drive.at((0.0, 0.0)) == [START]
+    assert drive.at((0.18, 0.0)) == [NONE]
+    assert drive.at((0.45, 0.0)) == [NONE]
+    assert drive.at((0.51, 0.0)) == [D_UPDATE]
+
+
+def test_at_the_goal_nothing_is_planned() -> None:
+    drive = Drive(goal=(0.5, 0.0))
+    drive.at((0.0, 0.0))
+    plan = drive.option.plan.copy()
+    assert drive.at((0.5, 0.2)) == [GOAL]
+    assert_array_equal(drive.option.plan, plan)
+
+
+def test_a_robot_that_starts_at_its_goal_still_gets_a_plan_first() -> None:
+    drive = Drive(goal=(0.1, 0.0))
+    assert drive.at((0.0, 0.0)) == [START]
+    assert np.isfinite(drive.option.plan).all()
+    assert drive.at((0.0, 0.0)) == [GOAL]
+
+
+def test_after_a_reset_a_plan_is_made_anew_and_counts_and_visits_are_gone() -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.0, 1.0))
+    drive.option.reset(np.array([1]))
+    assert drive.option.visits[1] is None and drive.option.visits[0] is not None
+    assert drive.option.counts[1].sum() == 0
+    assert drive.at((0.0, 0.0), (0.0, 1.0)) == [NONE, START]
+    assert np.isnan(drive.planner.queries[-1].previous).all()
+
+
+def test_after_a_change_of_goal_the_plan_is_dropped_and_the_episode_kept() -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.0, 1.0))
+    drive.goal[0] = (-2.0, 0.0)
+    drive.option.drop(np.array([0]))
+    assert drive.at((0.0, 0.0), (0.0, 1.0)) == [START, NONE]
+    assert_allclose(drive.option.plan[0, 0], [-0.1, 0.0])
+    assert drive.option.counts[:, START].tolist() == [2, 1]
+    assert drive.option.visits[0].counts.sum() == 1
+    assert np.isnan(drive.planner.queries[-1].previous).all(), "a plan to another goal is no plan to agree with"
+
+
+def test_with_a_period_plans_are_made_every_so_many_steps() -> None:
+    drive = Drive(rule=ReplanRule(period=4))
+    reasons = [drive.at((0.0, 3.0 * step / 13))[0] for step in range(13)]
+    assert [k for k, reason in enumerate(reasons) if reason != NONE] == [0, 4, 8, 12]
+
+
+def test_the_planner_is_told_the_plan_it_replaces() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    plan = drive.option.plan.copy()
+    assert drive.at((0.6, 0.0)) == [HALF_INDEX]
+    assert_array_equal(drive.planner.queries[-1].previous, plan)
+
+
+def test_reasons_are_counted_by_row() -> None:
+    drive = Drive(num_rows=2)
+    for x, y in [(0.0, 0.0), (0.3, 0.0), (0.6, 0.0), (0.6, 0.5), (2.5, 0.0)]:
+        drive.at((x, y), (0.0, 0.0))
+    expected = {NONE: 1, START: 1, HALF_INDEX: 1, D_UPDATE: 1, GOAL: 1, INVALID: 0}
+    assert {reason: int(drive.option.counts[0, reason]) for reason in TerminationReason} == expected
+    assert drive.option.counts[1].tolist() == [4, 1, 0, 0, 0, 0]
+
+
+# batches and subsets
+
+
+def test_each_robot_of_a_batch_has_its_own_end() -> None:
+    drive = Drive(num_rows=4)
+    drive.at(*[(0.0, 0.0)] * 4)
+    before = drive.option.plan.copy()
+    assert drive.at((0.2, 0.0), (0.6, 0.0), (0.2, 0.4), (2.4, 0.0)) == [NONE, HALF_INDEX, D_UPDATE, GOAL]
+    assert_array_equal(drive.option.plan[[0, 3]], before[[0, 3]])
+    assert_array_equal(drive.planner.queries[-1].position, [(0.6, 0.0), (0.2, 0.4)])
+
+
+def test_stepping_some_rows_leaves_the_others_untouched() -> None:
+    drive = Drive(num_rows=3)
+    drive.at(*[(0.0, 0.0)] * 3)
+    option = drive.option
+    names = ("plan", "start", "started", "age", "counts", "refused")
+    before = {name: getattr(option, name).copy() for name in names}
+    visits = [visit.counts.copy() for visit in option.visits]
+    step = option.step(np.array([[0.0, 2.0], [0.6, 0.0]]), drive.goal[:2], [FREE] * 2, rows=np.array([2, 0]))
+    assert step.reason.tolist() == [D_UPDATE, HALF_INDEX]
+    assert_allclose(step.start, [[0.0, 2.0], [0.6, 0.0]])
+    assert_allclose(option.start[[2, 0]], step.start)
+    for name in names:
+        assert_array_equal(getattr(option, name)[1], before[name][1], err_msg=name)
+    assert_array_equal(option.visits[1].counts, visits[1])
+    assert option.visits[2].counts.sum() == 2
+
+
+# what is not a number
+
+
+def test_without_a_plan_the_robot_holds_its_position_and_asks_again() -> None:
+    drive = Drive()
+    drive.planner.silent = True
+    assert drive.at((0.4, 0.2)) == [START]
+    assert_allclose(drive.option.plan[0], np.broadcast_to([0.4, 0.2], (10, 2)))
+    assert drive.at((0.41, 0.2)) == [START]
+    assert len(drive.planner.queries) == 2 and drive.option.refused[0] == 2
+    drive.planner.silent = False
+    assert drive.at((0.41, 0.2)) == [START]
+    assert drive.at((0.41, 0.2)) == [NONE]
+    assert drive.option.refused[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("rule", "position", "reason"),
+    [
+        (ReplanRule(), (0.6, 0.0), HALF_INDEX),
+        (ReplanRule(), (0.0, 0.5), D_UPDATE),
+        (ReplanRule(period=2), (0.1, 0.0), HALF_INDEX),
+        (ReplanRule(), (0.2, 0.0), INVALID),
+    ],
+)
+def test_a_refused_robot_keeps_its_plan_and_asks_again_at_every_step(
+    rule: ReplanRule, position: tuple[float, float], reason: TerminationReason
+) -> None:
+    drive = Drive(rule=rule)
+    drive.at((0.0, 0.0))
+    drive.at((0.05, 0.0))
+    if reason == INVALID:
+        drive.map = map_with_pillars([(0.8, 0.0)])
+    plan = drive.option.plan.copy()
+    drive.planner.silent = True
+    for count in (1, 2, 3):
+        assert drive.at(position) == [reason]
+        assert drive.option.refused[0] == count
+        assert_array_equal(drive.option.plan, plan)
+        assert_allclose(drive.option.start[0], 0.0)
+    drive.planner.silent = False
+    assert drive.at(position) == [reason]
+    assert_allclose(drive.option.start[0], position)
+
+
+def test_a_position_that_is_not_a_number_keeps_the_plan_and_is_not_shown_to_the_planner() -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.0, 0.0))
+    plan = drive.option.plan.copy()
+    assert drive.at((np.nan, np.nan), (0.1, 0.0)) == [D_UPDATE, NONE]
+    assert_array_equal(drive.option.plan, plan)
+    assert len(drive.planner.queries) == 1
+    assert drive.option.refused.tolist() == [1, 0]
+    assert drive.at((0.1, 0.0), (0.1, 0.0)) == [NONE, NONE], "a reading was missed, the plan still holds"
+
+
+def test_one_lost_robot_does_not_keep_the_others_from_planning() -> None:
+    drive = Drive(num_rows=2)
+    assert drive.at((np.nan, 0.0), (0.0, 0.0)) == [START, START]
+    assert np.isfinite(drive.option.plan[1]).all()
+    assert np.isnan(drive.option.plan[0]).any(axis=1).all()
+    assert drive.at((0.0, 1.0), (0.0, 0.0)) == [START, NONE]
+    assert np.isfinite(drive.option.plan).all()
+
+
+def test_a_planner_that_answers_in_another_shape_is_named() -> None:
+    drive = Drive()
+    drive.option.num_waypoints = 7
+    drive.option.__post_init__()
+    with pytest.raises(ValueError, match=r"shape \(1, 10, 2\), expected \(1, 7, 2\)"):
+        drive.at((0.0, 0.0))
+
+
+# the map changes under the plan
+
+
+@given(st.floats(0.1, 0.5), st.integers(1, 10))
+def test_an_obstacle_on_the_remaining_plan_ends_it_and_one_on_the_used_part_does_not(x: float, waypoint: int) -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    drive.at((x, 0.0))
+    line = drive.option.line()
+    # narrower than the spacing, so that with the robot's radius it meets this waypoint alone
+    drive.map = map_with_pillars([line[0, waypoint]], radius=0.04)
+    drive.option.sweep_radius = 0.04
+    ahead = waypoint >= nearest_vertex(np.array([[[x, 0.0]]]), line)[0][0, 0]
+    assert drive.at((x, 0.0)) == [INVALID if ahead else NONE]
+
+
+def test_a_plan_that_is_freed_again_goes_on() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    drive.at((0.1, 0.0))
+    drive.planner.silent, drive.map = True, map_with_pillars([(0.8, 0.0)])
+    assert drive.at((0.1, 0.0)) == [INVALID]
+    drive.map = FREE
+    assert drive.at((0.1, 0.0)) == [NONE]
+
+
+def test_in_the_paper_s_rule_the_map_does_not_end_a_plan() -> None:
+    drive = Drive(rule=ReplanRule(invalid=False))
+    drive.at((0.0, 0.0))
+    drive.map = map_with_pillars([(0.8, 0.0)])
+    assert [drive.at((0.1, 0.0)), drive.at((0.2, 0.0))] == [[NONE], [NONE]]
+
+
+def test_a_blocked_proposal_is_not_asked_for_again_where_it_was_made() -> None:
+    """The straight planner goes through the pillar; asking at every tick would give the same plan."""
+    drive = Drive()
+    drive.map = map_with_pillars([(0.8, 0.0)])
+    assert drive.at((0.0, 0.0)) == [START]
+    assert [drive.at((0.0, 0.0)), drive.at((0.04, 0.0))] == [[NONE], [NONE]]
+    assert drive.at((0.06, 0.0)) == [INVALID]
+
+
+def test_the_line_of_an_option_is_its_plan_behind_its_start() -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.3, 0.1))
+    assert_array_equal(drive.option.line(), polyline(drive.option.start, drive.option.plan))
