@@ -24,12 +24,12 @@ def divide(line: np.ndarray, spacing: float) -> np.ndarray:
         spacing: distance between the new vertices along the line [m].
 
     Returns:
-        (N, W, 2), where W fits the longest line; shorter ones repeat their last point.
+        (N, W, 2), where W fits the longest line; shorter ones repeat their last point, NaN lines stay NaN.
     """
     if not spacing > 0:
         raise ValueError(f"spacing must be positive, got {spacing} m")
     arc = arc_lengths(line)
-    count = int(np.floor(np.max(arc[:, -1], initial=0.0) / spacing + 1e-6)) + 2
+    count = int(np.floor(_longest(arc[:, -1]) / spacing + 1e-6)) + 2
     stations = np.minimum(np.arange(count) * spacing, arc[:, -1:])
     return point_at(line, stations, arc)
 
@@ -83,10 +83,10 @@ def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, s
         spacing: at which the motion is divided [m].
 
     Returns:
-        (N,) max over the motion of the distance to the closest plan vertex [m].
+        (N,) max over the motion of the distance to the closest plan vertex [m]; NaN where a row is NaN.
     """
     length = np.linalg.norm(after - before, axis=-1)
-    count = int(np.ceil(np.max(length, initial=0.0) / spacing - 1e-9)) + 1
+    count = int(np.ceil(_longest(length) / spacing - 1e-9)) + 1
     t = np.linspace(0.0, 1.0, max(count, 2))[None, :, None]
     motion = (1.0 - t) * before[:, None, :] + t * after[:, None, :]
     return nearest_vertex(motion, vertices)[1].max(axis=1)
@@ -119,3 +119,8 @@ def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     direction = edge[rows, first] / np.maximum(length[rows, first], _TINY)[:, None]
     behind = ((points - line[:, 0]) * direction).sum(-1)
     return np.where((along <= 0.0) & (behind < 0.0), behind, along)
+
+
+def _longest(lengths: np.ndarray) -> float:
+    # one robot whose position is lost must not keep the others from going on
+    return float(np.max(lengths, initial=0.0, where=np.isfinite(lengths)))
