@@ -60,7 +60,9 @@ class DriverConfig:
     max_steps: int = 300
     """Control steps after which a run ends by timeout."""
     blind_timeout: float = 2.0
-    """Without an estimate for this long, at the start or while running, the run ends in a fault [s]."""
+    """Without a fresh estimate for this long, at the start or while running, the run ends in a fault [s]."""
+    blind_ticks: int = 5
+    """An estimate that has not changed for more control periods than this is not driven on."""
     stop_speed: float = 0.1
     """A robot slower than this, three readings in a row, has stopped [m/s]."""
     stop_timeout: float = 3.0
@@ -150,7 +152,6 @@ class Driver:
         self.supervisor = Supervisor()
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
         self._observers = list(observers)
-        self._terms = TermHold()
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -170,7 +171,9 @@ class Driver:
         self._estimate: Estimate | None = None
         self._began_at: float | None = None
         self._last_stamp = 0.0
-        self._blind_since: float | None = None
+        self._fresh_at: float | None = None
+        self._fresh_stamp = -math.inf
+        self._terms = TermHold()
         self._replans: Counter[str] = Counter()
         self.agent.reset()
         self.guard.reset()
@@ -213,13 +216,11 @@ class Driver:
         timer.mark("read")
         self._estimate = estimate = self.estimator.update(frame)
         timer.mark("estimate")
-        if estimate is None:
+        if self._is_blind(estimate, now) or estimate is None:
             self.robot.brake()
             timer.mark("send")
-            self._wait_blindly(frame.stamp, now)
             self._finish_tick(Tick(now, self.supervisor.mode, frame, None, None, None, self.goal))
             return self._reason is not None
-        self._blind_since = None
         if self.supervisor.mode is not Mode.RUNNING:
             self._start(frame.stamp, now)
         occupancy = self.occupancy(frame.stamp)
@@ -259,11 +260,17 @@ class Driver:
             self._reason = "timeout"
         return self._reason is not None
 
-    def _wait_blindly(self, stamp: float, now: float) -> None:
-        if self._blind_since is None:
-            self._blind_since = stamp
-        if stamp - self._blind_since > self.config.blind_timeout:
-            self._fail(f"no position and heading for {self.config.blind_timeout:g} s", now)
+    def _is_blind(self, estimate: Estimate | None, now: float) -> bool:
+        """Whether there is no estimate, or one that sensors no longer renew; for too long, that is a fault."""
+        if self._fresh_at is None:
+            self._fresh_at = now
+        if estimate is not None and estimate.stamp > self._fresh_stamp:
+            self._fresh_at, self._fresh_stamp = now, estimate.stamp
+            return False
+        age = now - self._fresh_at
+        if age > self.config.blind_timeout:
+            self._fail(f"no fresh position and heading for {self.config.blind_timeout:g} s", now)
+        return estimate is None or age > self.config.blind_ticks * self.robot.control_period
 
     def _fail(self, why: str, now: float) -> None:
         self._reason = "fault"

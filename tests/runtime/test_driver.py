@@ -1,0 +1,345 @@
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hiernav.nav.occupancy import OccupancyMap, empty_map
+from hiernav.nav.option import TerminationReason
+from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.driver import Driver, DriverConfig, TermHold, Tick
+from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.sim_robot import SimRobot
+from hiernav.runtime.summary import Episode, print_summary, summarise
+from hiernav.runtime.supervisor import InvalidTransition, Mode
+from hiernav.sim.robots import get_robot
+from hiernav.sim.worlds import parse_world, sample_layout
+
+GOAL = np.array([0.98, 0.0])
+PERIOD = 0.1
+
+
+@dataclass
+class Puck:
+    """A robot that slides where it is pushed: the action is its velocity in x and y."""
+
+    control_period: float = PERIOD
+    action_dim: int = 2
+    position: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    stamp: float = 0.0
+    log: list[str] = field(default_factory=list)
+    sees: Callable[[SensorFrame], SensorFrame] = lambda frame: frame
+    stops: bool = True
+
+    def read(self) -> SensorFrame:
+        self.log.append("read")
+        return self.sees(
+            SensorFrame(
+                stamp=self.stamp,
+                accelerometer=np.array([0.0, 0.0, 9.81]),
+                gyro=np.zeros(3),
+                magnetometer=np.array([0.0, -0.5, 0.0]),
+                velocimeter=np.array([*self.velocity, 0.0]),
+                lidar=np.zeros(10),
+                position_fix=self.position.copy(),
+            )
+        )
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        self.log.append("send")
+        self._move(action)
+        return action
+
+    def brake(self) -> None:
+        self.log.append("brake")
+        self._move(np.zeros(2) if self.stops else self.velocity)
+
+    def close(self) -> None:
+        self.log.append("close")
+
+    def _move(self, velocity: np.ndarray) -> None:
+        self.velocity = np.array(velocity)
+        self.position = self.position + self.velocity * PERIOD
+        self.stamp += PERIOD
+
+
+@dataclass
+class Decided:
+    action: np.ndarray
+    reason: np.ndarray
+    plan: np.ndarray
+    replanned: np.ndarray
+    plan_seconds: float = 0.001
+
+
+@dataclass
+class Scripted:
+    """An agent that goes straight at half speed, or does what `script` says at each step."""
+
+    script: Callable[[int, np.ndarray], np.ndarray] = lambda step, straight: straight
+    steps: int = 0
+    resets: int = 0
+    seen: list[Mapping[str, np.ndarray]] = field(default_factory=list)
+
+    def reset(self) -> None:
+        self.steps = 0
+        self.resets += 1
+
+    def act(
+        self, pose: np.ndarray, terms: Mapping[str, np.ndarray], goal: np.ndarray, occupancy: Sequence[OccupancyMap]
+    ) -> Decided:
+        assert pose.shape == (1, 3) and goal.shape == (1, 2) and len(occupancy) == 1
+        self.seen.append(terms)
+        towards = goal[0] - pose[0, :2]
+        action = self.script(self.steps, 0.5 * towards / np.linalg.norm(towards))
+        reason = TerminationReason.START if self.steps == 0 else TerminationReason.NONE
+        if self.steps and self.steps % 5 == 0:
+            reason = TerminationReason.HALF_INDEX
+        self.steps += 1
+        return Decided(
+            action=np.asarray(action, dtype=np.float32)[None],
+            reason=np.array([reason], dtype=np.int8),
+            plan=np.zeros((1, 10, 2)),
+            replanned=np.array([reason != TerminationReason.NONE]),
+        )
+
+
+def driver_of(robot: Puck | None = None, agent: Scripted | None = None, **settings: object) -> Driver:
+    field_map = empty_map((2.0, 2.0))
+    settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False)))
+    return Driver(robot or Puck(), agent or Scripted(), lambda stamp: field_map, FakeClock(), **settings)
+
+
+def test_a_goal_in_the_open_is_reached_and_the_robot_stands_there():
+    robot = Puck()
+    driver = driver_of(robot)
+    result = driver.run(GOAL)
+    assert result.reached and result.reason == "goal" and result.stopped
+    assert result.distance <= 0.3
+    assert np.linalg.norm(robot.position - GOAL) < 0.35
+    assert result.steps == 14
+    assert result.seconds == pytest.approx(1.4)
+    assert result.replans == {"start": 1, "half_index": 2}
+    assert driver.supervisor.mode is Mode.STOPPED
+
+
+def test_every_tick_reads_before_it_sends_and_the_run_ends_with_the_brake():
+    robot = Puck()
+    driver_of(robot).run(GOAL)
+    drive = robot.log[: robot.log.index("brake")]
+    assert drive == ["read", "send"] * 14 + ["read"]
+    assert robot.log[-1] == "brake"
+    assert "send" not in robot.log[len(drive) :]
+
+
+def test_a_run_that_takes_too_long_ends_by_timeout():
+    result = driver_of(agent=Scripted(lambda step, straight: np.zeros(2))).run(GOAL, max_steps=7)
+    assert (result.reason, result.steps, result.reached) == ("timeout", 7, False)
+
+
+def test_leaving_the_field_ends_the_run():
+    robot = Puck()
+    result = driver_of(robot, Scripted(lambda step, straight: np.array([-1.0, 0.0]))).run(GOAL)
+    assert result.reason == "left_field"
+    assert robot.position[0] == pytest.approx(-2.0, abs=0.35)
+
+
+def test_an_exception_in_the_agent_is_a_fault_that_brakes_and_latches():
+    def script(step: int, straight: np.ndarray) -> np.ndarray:
+        if step == 3:
+            raise RuntimeError("network exploded")
+        return straight
+
+    robot = Puck()
+    driver = driver_of(robot, Scripted(script))
+    result = driver.run(GOAL)
+    assert (result.reason, result.fault) == ("fault", "RuntimeError: network exploded")
+    assert result.stopped and robot.log[-1] == "brake"
+    with pytest.raises(InvalidTransition):
+        driver.run(GOAL)
+    driver.supervisor.acknowledge(0.0)
+    robot.position = np.zeros(2)
+    assert driver.run(GOAL).reason == "fault"
+
+
+def test_three_actions_that_are_not_finite_end_in_a_fault_and_none_is_sent():
+    robot = Puck()
+    result = driver_of(robot, Scripted(lambda step, straight: straight * (math.nan if step >= 5 else 1.0))).run(GOAL)
+    assert result.reason == "fault" and "not finite 3 times in a row" in result.fault
+    assert result.guard == {"non_finite": 3}
+    assert result.steps == 8
+    assert np.isfinite(robot.position).all()
+
+
+def test_a_single_bad_action_only_brakes_its_tick():
+    result = driver_of(agent=Scripted(lambda step, straight: straight * (math.nan if step == 5 else 1.0))).run(GOAL)
+    assert result.reached
+    assert result.steps == 15
+
+
+def test_a_keyboard_interrupt_stops_the_robot():
+    def script(step: int, straight: np.ndarray) -> np.ndarray:
+        if step == 4:
+            raise KeyboardInterrupt
+        return straight
+
+    robot = Puck()
+    driver = driver_of(robot, Scripted(script))
+    result = driver.run(GOAL)
+    assert (result.reason, result.stopped) == ("interrupted", True)
+    assert robot.log[-1] == "brake"
+    assert driver.supervisor.mode is Mode.STOPPED
+
+
+def test_a_robot_that_does_not_stop_is_reported():
+    robot = Puck(stops=False)
+    result = driver_of(robot, config=DriverConfig(stop_timeout=1.0)).run(GOAL)
+    assert result.reached and not result.stopped
+    assert robot.log[-1] == "brake"
+
+
+def test_a_robot_that_does_not_know_where_it_is_stays_braked():
+    robot = Puck(sees=lambda frame: replace(frame, position_fix=None))
+    driver = driver_of(robot)
+    result = driver.run(GOAL)
+    assert result.reason == "fault" and "no fresh position" in result.fault
+    assert "send" not in robot.log
+    assert result.steps == 0 and math.isnan(result.distance)
+
+
+def test_a_robot_waits_for_its_first_fix_and_then_goes():
+    robot = Puck(sees=lambda frame: frame if frame.stamp > 0.75 else replace(frame, position_fix=None))
+    result = driver_of(robot).run(GOAL)
+    assert result.reached and result.steps == 14
+
+
+def test_sensors_that_repeat_themselves_are_not_driven_on_for_long():
+    frozen: list[SensorFrame] = []
+
+    def freeze(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp > 0.35:
+            frozen.append(frame)
+            return frozen[0]
+        return frame
+
+    robot = Puck(sees=freeze)
+    result = driver_of(robot, Scripted(lambda step, straight: np.array([0.1, 0.0]))).run(GOAL)
+    assert result.reason == "fault"
+    assert result.steps == 10
+
+
+def test_a_fallen_robot_is_a_fault():
+    on_its_side = {"accelerometer": np.array([0.0, 9.81, 0.0]), "magnetometer": np.array([-0.5, 0.0, 0.0])}
+    robot = Puck(sees=lambda frame: frame if frame.stamp < 0.25 else replace(frame, **on_its_side))
+    driver = driver_of(
+        robot,
+        Scripted(lambda step, straight: np.array([0.02, 0.0])),
+        estimator=Estimator(EstimatorConfig()),
+        guard=Guard(2, GuardConfig(tilt_limit=1.0)),
+    )
+    result = driver.run(GOAL)
+    assert result.reason == "fault" and "tilted" in result.fault
+
+
+def test_each_run_starts_the_agent_afresh():
+    agent, robot = Scripted(), Puck()
+    driver = driver_of(robot, agent)
+    first = driver.run(GOAL)
+    robot.position = np.zeros(2)
+    second = driver.run(GOAL)
+    assert agent.resets == 2
+    assert first.replans == second.replans
+    assert second.steps == first.steps
+
+
+@pytest.mark.parametrize("goal", [[math.nan, 0.0], [1.0], [[1.0, 2.0]]])
+def test_a_goal_must_be_two_finite_coordinates(goal):
+    robot = Puck()
+    with pytest.raises(ValueError, match="goal"):
+        driver_of(robot).run(goal)
+    assert robot.log == []
+
+
+def test_observers_see_every_tick_and_a_failing_one_does_not_stop_the_robot():
+    ticks: list[Tick] = []
+
+    def broken(tick: Tick) -> None:
+        raise OSError("disk full")
+
+    result = driver_of(observers=[broken, ticks.append]).run(GOAL)
+    assert result.reached
+    assert len(ticks) == result.steps + 1
+    assert all(tick.mode is Mode.RUNNING and tick.sent is not None for tick in ticks[:-1])
+
+
+def test_a_missing_or_broken_reading_keeps_its_last_good_value():
+    hold = TermHold()
+    gyro = np.array([1.0, 2.0, 3.0])
+    hold.fill(SensorFrame(0.0, gyro=gyro, extra={"wheel": np.array([4.0])}))
+    missing = hold.fill(SensorFrame(0.1))
+    np.testing.assert_array_equal(missing["gyro"], gyro[None])
+    np.testing.assert_array_equal(missing["wheel"], [[4.0]])
+    partly = hold.fill(SensorFrame(0.2, gyro=np.array([7.0, math.nan, 9.0])))
+    np.testing.assert_array_equal(partly["gyro"], [[7.0, 2.0, 9.0]])
+    assert hold.held == 4
+
+
+def test_the_summary_is_json_and_readable():
+    driver = driver_of()
+    result = driver.run(GOAL)
+    summary = summarise([Episode(3, result, collisions=0)], driver.timer, driver.loop, {"timer_slack": "granted"})
+    again = json.loads(json.dumps(summary, allow_nan=False))
+    assert again == summary
+    episode = summary["episodes"][0]
+    assert (episode["seed"], episode["reached"], episode["reason"], episode["steps"]) == (3, True, "goal", 14)
+    assert set(summary["timing"]["sections"]) == {"read", "estimate", "plan", "infer", "guard", "send"}
+    assert summary["timing"]["sections"]["plan"]["count"] == 3
+    assert summary["timing"]["sections"]["send"]["count"] == 14
+    assert set(summary["timing"]["lateness"]) >= {"p50", "p99", "max"}
+    assert summary["replans"] == {"start": 1, "half_index": 2}
+    screen = io.StringIO()
+    print_summary(summary, Console(file=screen, width=120))
+    assert "1 of 1 goals reached" in screen.getvalue()
+    assert "half_index 2, start 1" in screen.getvalue()
+
+
+def test_a_summary_without_a_position_is_json_too():
+    driver = driver_of(Puck(sees=lambda frame: replace(frame, position_fix=None)))
+    summary = summarise([Episode(None, driver.run(GOAL))], driver.timer, driver.loop, {})
+    assert json.loads(json.dumps(summary, allow_nan=False))["episodes"][0]["distance"] is None
+    print_summary(summary, Console(file=io.StringIO()))
+
+
+def test_a_simulated_point_robot_drives_to_its_goal_on_noisy_sensors():
+    layout = sample_layout(parse_world("pillar(2,2,0)"), seed=5)
+    robot = SimRobot(get_robot("point"), layout, seed=1)
+
+    def steer(step: int, straight: np.ndarray) -> np.ndarray:
+        pose = agent.seen_pose
+        bearing = math.atan2(straight[1], straight[0])
+        turn = math.remainder(bearing - pose[2], 2 * math.pi)
+        return np.array([0.3 * (math.cos(turn) > 0.9), np.clip(2.0 * turn, -1.0, 1.0)])
+
+    class Steering(Scripted):
+        def act(self, pose, terms, goal, occupancy):
+            self.seen_pose = pose[0]
+            return super().act(pose, terms, goal, occupancy)
+
+    agent = Steering(steer)
+    driver = Driver(
+        robot, agent, robot.occupancy, FakeClock(), Estimator(EstimatorConfig(tilts=False)), Guard(robot.action_dim)
+    )
+    result = driver.run(layout.goal, max_steps=2000)
+    assert result.reached and result.stopped
+    truth = robot.truth()
+    assert np.linalg.norm(truth.pose[:2] - layout.goal) < 0.5
+    assert np.linalg.norm(truth.velocity) < 0.15

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hiernav.runtime.supervisor import TRANSITIONS, InvalidTransition, Mode, Supervisor
+
+
+def supervisor_in(*path: Mode) -> Supervisor:
+    supervisor = Supervisor()
+    for mode in path:
+        supervisor.change(mode, "test", 0.0)
+    return supervisor
+
+
+def test_a_run_goes_from_init_to_stopped_and_round_again():
+    supervisor = supervisor_in(Mode.READY, Mode.ARMED, Mode.RUNNING, Mode.STOPPED, Mode.INIT)
+    assert supervisor.mode is Mode.INIT
+
+
+@given(st.lists(st.sampled_from(Mode), max_size=30))
+def test_only_transitions_of_the_table_ever_happen(wishes):
+    supervisor = Supervisor()
+    for wish in wishes:
+        before = supervisor.mode
+        if wish in TRANSITIONS[before]:
+            supervisor.change(wish, "test", 0.0)
+            assert supervisor.mode is wish
+        else:
+            with pytest.raises(InvalidTransition, match=f"{before.name} -> {wish.name}"):
+                supervisor.change(wish, "test", 0.0)
+            assert supervisor.mode is before
+
+
+def test_nothing_runs_that_was_not_armed():
+    assert {mode for mode in Mode if Mode.RUNNING in TRANSITIONS[mode]} == {Mode.ARMED}
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_fault_is_possible_anywhere_and_latches_with_its_first_reason(mode):
+    supervisor = Supervisor()
+    supervisor.mode = mode
+    supervisor.fault = "first" if mode is Mode.FAULT else None
+    supervisor.fail("first", 1.0)
+    supervisor.fail("second", 2.0)
+    assert (supervisor.mode, supervisor.fault) == (Mode.FAULT, "first")
+    for wish in Mode:
+        with pytest.raises(InvalidTransition):
+            supervisor.change(wish, "test", 3.0)
+    supervisor.acknowledge(4.0)
+    assert (supervisor.mode, supervisor.fault) == (Mode.INIT, None)
+
+
+def test_there_is_nothing_to_acknowledge_without_a_fault():
+    with pytest.raises(InvalidTransition, match="no fault"):
+        Supervisor().acknowledge(0.0)
+
+
+def test_every_change_is_remembered_with_its_reason():
+    supervisor = supervisor_in(Mode.READY)
+    supervisor.fail("pinned", 2.5)
+    assert list(supervisor.history) == [(0.0, Mode.READY, "test"), (2.5, Mode.FAULT, "pinned")]
