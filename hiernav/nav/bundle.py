@@ -1,0 +1,297 @@
+"""The bundle: two networks and everything they assume, in one folder that is verified before it is used.
+
+`planner.onnx`, `skill.onnx`, `golden.npz` (inputs with the outputs they must give) and `manifest.json`. The bytes that
+were hashed are the bytes that are handed out; nothing is read twice and nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from hiernav.nav.observation import ObservationLayout, ObservationTerm
+from hiernav.nav.onnx_file import OnnxFacts, OnnxFileError, inspect_onnx
+
+FORMAT_VERSION = 1
+PLANNER, SKILL, GOLDEN, MANIFEST = "planner.onnx", "skill.onnx", "golden.npz", "manifest.json"
+HASHED_FILES = (PLANNER, SKILL, GOLDEN)
+MAX_FILE_BYTES = 50_000_000
+MAX_MANIFEST_BYTES = 1_000_000
+GOLDEN_NAMES = ("observation", "action", "image", "distance", "waypoints", "scores")
+"""Arrays of `golden.npz`: skill input and output, planner inputs and outputs."""
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class BundleError(ValueError):
+    """A bundle that must not be used; the message names what does not fit."""
+
+
+class _Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class TensorSpec(_Struct):
+    """An input or output of a network."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    """None is the batch."""
+    dtype: str
+
+
+class SkillSpec(_Struct):
+    """The skill network: observations to actions."""
+
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+
+
+class PlannerSpec(_Struct):
+    """The planner network: GOSELO images and distances to waypoints and scores."""
+
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    preset: str
+    channels: Count
+
+
+class ObservationField(_Struct):
+    """One term of the observation, as `ObservationTerm`."""
+
+    name: str
+    size: Count
+    unit: str
+    scale: float
+
+
+class GoseloSpec(_Struct):
+    """How the planner's images are made."""
+
+    pixels: Count
+    channels: tuple[str, ...]
+    local_side_m: Positive
+
+
+class PlanSpec(_Struct):
+    """What a plan looks like."""
+
+    waypoints: Count
+    spacing_m: Positive
+    planning_radius_m: Positive
+
+
+class ReplanSpec(_Struct):
+    """Thresholds of the rule that ends an option."""
+
+    d_update_m: Positive
+    half_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+    invalid: bool
+
+
+class GuardSpec(_Struct):
+    """What the guard must do so that the skill drives as it was trained."""
+
+    slew_limit: Positive | None = None
+
+
+class Manifest(_Struct):
+    """Everything the networks assume."""
+
+    format_version: int = FORMAT_VERSION
+    robot: str
+    robot_sha256: Sha256
+    """Of the robot's model file."""
+    control_period_s: Positive
+    map_resolution_m: Positive
+    files: dict[str, Sha256] = {}
+    """Filled in by `write_manifest`."""
+    opset: int = 0
+    """Filled in by `write_manifest`."""
+    planner: PlannerSpec
+    skill: SkillSpec
+    observation: tuple[ObservationField, ...]
+    goselo: GoseloSpec
+    plan: PlanSpec
+    replan: ReplanSpec
+    guard: GuardSpec = GuardSpec()
+    provenance: dict[str, str | int | float] = {}
+    """Where the networks come from; for people."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A verified bundle in memory."""
+
+    manifest: Manifest
+    planner: bytes
+    """Serialised ONNX model."""
+    skill: bytes
+    """Serialised ONNX model."""
+    golden: Mapping[str, np.ndarray]
+
+    @property
+    def layout(self) -> ObservationLayout:
+        """The observation the skill was trained on."""
+        fields = self.manifest.observation
+        return ObservationLayout(tuple(ObservationTerm(f.name, f.size, f.unit, f.scale) for f in fields))
+
+    def require_robot(self, name: str, sha256: str) -> None:
+        """Raise BundleError unless the bundle was made for this robot and this very model file of it."""
+        if name != self.manifest.robot:
+            raise BundleError(f"robot: the bundle is for {self.manifest.robot!r}, this is {name!r}")
+        if sha256 != self.manifest.robot_sha256:
+            raise BundleError(
+                f"robot_sha256: the model of {name!r} has changed since training "
+                f"({self.manifest.robot_sha256[:12]} in the bundle, {sha256[:12]} here)"
+            )
+
+    def require_layout(self, layout: ObservationLayout) -> None:
+        """Raise BundleError naming the first field in which the robot's observation differs from the bundle's."""
+        ours, theirs = layout.terms, self.layout.terms
+        for index, (here, there) in enumerate(zip(ours, theirs, strict=False)):
+            for key in ("name", "size", "unit", "scale"):
+                if getattr(here, key) != getattr(there, key):
+                    raise BundleError(
+                        f"observation[{index}] {there.name!r}: {key} is {getattr(there, key)!r} in the bundle, "
+                        f"{getattr(here, key)!r} on this robot"
+                    )
+        if len(ours) != len(theirs):
+            longer, where = (ours, "on this robot") if len(ours) > len(theirs) else (theirs, "in the bundle")
+            index = min(len(ours), len(theirs))
+            raise BundleError(f"observation[{index}] {longer[index].name!r}: it exists only {where}")
+
+
+def write_golden(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write `golden.npz`; ValueError unless `arrays` has exactly the `GOLDEN_NAMES`."""
+    if set(arrays) != set(GOLDEN_NAMES):
+        raise ValueError(f"golden arrays are {', '.join(sorted(arrays))}; they must be {', '.join(GOLDEN_NAMES)}")
+    np.savez_compressed(folder / GOLDEN, **{name: np.asarray(array) for name, array in arrays.items()})
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> Manifest:
+    """Write `manifest.json` last, over the files that are already in `folder`.
+
+    Returns:
+        The manifest with hashes and opset filled in.
+
+    Raises:
+        BundleError: the folder would not make a bundle that can be loaded.
+    """
+    contents = {name: _read(folder, name, MAX_FILE_BYTES) for name in HASHED_FILES}
+    opsets = {name: _check_model(contents[name], name).opset for name in (PLANNER, SKILL)}
+    if len(set(opsets.values())) != 1:
+        raise BundleError(f"opset: {', '.join(f'{name} has {opset}' for name, opset in opsets.items())}")
+    _decode_golden(contents[GOLDEN])
+    files = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+    manifest = msgspec.structs.replace(manifest, files=files, opset=opsets[SKILL])
+    encoded = msgspec.json.format(msgspec.json.encode(manifest), indent=2)
+    _decode_manifest(encoded)
+    partial = folder / (MANIFEST + ".part")
+    partial.write_bytes(encoded + b"\n")
+    partial.replace(folder / MANIFEST)
+    return manifest
+
+
+def load_bundle(path: str | Path) -> Bundle:
+    """Read and verify a bundle.
+
+    Raises:
+        BundleError: a file is missing, too large or altered, the manifest is malformed or made by a newer version, or a
+            model has external data or custom operators.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise BundleError(f"{folder}: no such folder")
+    manifest = _decode_manifest(_read(folder, MANIFEST, MAX_MANIFEST_BYTES))
+    contents: dict[str, bytes] = {}
+    for name in HASHED_FILES:
+        contents[name] = data = _read(folder, name, MAX_FILE_BYTES)
+        if hashlib.sha256(data).hexdigest() != manifest.files[name]:
+            raise BundleError(f"{name}: SHA-256 differs from the manifest; the file is truncated or altered")
+    for name in (PLANNER, SKILL):
+        opset = _check_model(contents[name], name).opset
+        if opset != manifest.opset:
+            raise BundleError(f"{name}: opset {opset}, the manifest says {manifest.opset}")
+    return Bundle(manifest, contents[PLANNER], contents[SKILL], _decode_golden(contents[GOLDEN]))
+
+
+def file_sha256(path: str | Path) -> str:
+    """SHA-256 of a file, as the manifest keeps it for the robot's model."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+class _Version(msgspec.Struct):
+    format_version: int
+
+
+def _decode_manifest(data: bytes) -> Manifest:
+    try:
+        # First and leniently: what a newer format looks like beyond this field cannot be known here.
+        version = msgspec.json.decode(data, type=_Version).format_version
+        if version > FORMAT_VERSION:
+            raise BundleError(
+                f"{MANIFEST}: format_version {version} was made by a newer hiernav (this one reads {FORMAT_VERSION}): "
+                "upgrade hiernav"
+            )
+        if version < 1:
+            raise BundleError(f"{MANIFEST}: format_version {version}, the first one is 1")
+        manifest = msgspec.json.decode(data, type=Manifest)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise BundleError(f"{MANIFEST}: {error}") from None
+    if set(manifest.files) != set(HASHED_FILES):
+        raise BundleError(
+            f"{MANIFEST}: files lists {', '.join(sorted(map(repr, manifest.files))) or 'nothing'}; "
+            f"it must list exactly {', '.join(HASHED_FILES)}"
+        )
+    return manifest
+
+
+def _read(folder: Path, name: str, limit: int) -> bytes:
+    path = folder / name
+    if not path.is_file():
+        raise BundleError(f"{name}: missing in {folder}")
+    with path.open("rb") as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise BundleError(f"{name}: larger than {limit / 1e6:g} MB")
+    return data
+
+
+def _check_model(data: bytes, name: str) -> OnnxFacts:
+    try:
+        facts = inspect_onnx(data)
+    except OnnxFileError as error:
+        raise BundleError(f"{name}: not an ONNX model: {error}") from None
+    if facts.external_data:
+        raise BundleError(f"{name}: weights in external files are not accepted")
+    if facts.custom_operators:
+        raise BundleError(f"{name}: custom operators are not accepted: {', '.join(facts.custom_operators)}")
+    return facts
+
+
+def _decode_golden(data: bytes) -> dict[str, np.ndarray]:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            inflated = sum(entry.file_size for entry in archive.infolist())
+        if inflated > MAX_FILE_BYTES:
+            raise BundleError(f"{GOLDEN}: inflates to more than {MAX_FILE_BYTES / 1e6:g} MB")
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            golden = {name: arrays[name] for name in arrays.files}
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
+        if isinstance(error, BundleError):
+            raise
+        raise BundleError(f"{GOLDEN}: {error}") from None
+    if set(golden) != set(GOLDEN_NAMES):
+        raise BundleError(f"{GOLDEN}: holds {', '.join(sorted(golden))}; it must hold {', '.join(GOLDEN_NAMES)}")
+    return golden
