@@ -18,15 +18,17 @@ ALLOWED = {
     "decode": set(),
     "config": {"decode"},
     "nav": set(),
-    "sim": {"nav"},
-    "planner": {"nav", "sim", "config"},
-    "skill": {"nav", "sim", "config"},
+    "sim": {"nav", "config"},
+    "run": {"config"},
+    "planner": {"nav", "sim", "config", "run"},
+    "skill": {"nav", "sim", "config", "run"},
+    "training": {"planner", "skill", "run"},
     "runtime": {"nav", "decode"},
-    "evaluate": {"nav", "sim", "planner", "skill", "config"},
-    "export": {"nav", "sim", "planner", "skill", "evaluate", "config"},
+    "evaluate": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
+    "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
     "report": {"nav", "sim", "evaluate", "config", "draw"},
-    "cli": {"nav", "sim", "planner", "skill", "runtime", "evaluate", "export", "report", "draw", "config", "decode"},
+    "cli": {"nav", "sim", "evaluate", "export", "report", "draw", "config", "decode", "run", "training"},
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
 TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}

@@ -29,6 +29,7 @@ GOLDEN_NAMES = ("observation", "action", "image", "distance", "waypoints", "scor
 """Arrays of `golden.npz`: skill input and output, planner inputs and outputs."""
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
@@ -37,7 +38,7 @@ class BundleError(ValueError):
     """A bundle that must not be used; the message names what does not fit."""
 
 
-class _Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class _Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 
 
@@ -89,6 +90,9 @@ class PlanSpec(_Struct):
     waypoints: Count
     spacing_m: Positive
     planning_radius_m: Positive
+    """Disc that must fit on a plan."""
+    soft_margin_m: NonNegative
+    """Further clearance worth a detour when a plan is repaired."""
 
 
 class ReplanSpec(_Struct):
@@ -105,7 +109,7 @@ class GuardSpec(_Struct):
     slew_limit: Positive | None = None
 
 
-class Manifest(_Struct):
+class Manifest(_Struct, frozen=True, kw_only=True):
     """Everything the networks assume."""
 
     format_version: int = FORMAT_VERSION

@@ -4,11 +4,12 @@ Both maps are rotated and translated so that the goal G is straight above the po
 centre, cropped to squares of side L + 0.4 m, 2 L and 4 L, L = |GP|, and resampled to 64 x 64. Resampling preserves
 area: each crop is taken from the level of a mean pyramid that is at most twice as fine as its pixels, and the rest is
 averaged. Beyond the paper, `local` is a crop of fixed metric size around the robot at map resolution, because the
-others lose metric size to the normalisation by L.
+others lose metric size to the normalisation by L, and `clearance` shows the distance to what is in the way.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,15 +20,19 @@ from hiernav.nav.occupancy import OccupancyMap, VisitMap
 
 PIXELS = 64
 CHANNELS = ("obstacles_1", "obstacles_2", "obstacles_4", "visits_1", "visits_2", "visits_4")
-LOCAL_CHANNELS = (*CHANNELS, "obstacles_local")
+"""The paper's image: two maps, each in crops of side L + 0.4 m, 2 L and 4 L."""
+METRIC_CHANNELS = ("obstacles_1", "obstacles_2", "obstacles_4", "clearance_local")
+"""Obstacles as in the paper, and the clearance around the robot in a crop of fixed size."""
 LOCAL_SIDE = 3.2
 """Side of the local crop [m]: 64 pixels of 0.05 m."""
 MARGIN = 0.4
-"""Added to L for the first crop: 4 cells of 0.1 m."""
+"""Added to L for the first crop [m]: 4 cells of 0.1 m."""
 MIN_DISTANCE = 0.1
 """L is at least this [m], so that a robot at its goal still has a frame."""
 VISIT_CLIP = 4
 """Entries into a pixel beyond this look the same."""
+CLEARANCE_CLIP = 0.64
+"""Clearance that a pixel value of 255 stands for [m]."""
 
 
 @dataclass(frozen=True)
@@ -73,38 +78,72 @@ def images(
     occupancy: Sequence[OccupancyMap],
     visits: Sequence[VisitMap],
     frame: GoseloFrame,
-    channels: tuple[str, ...] = CHANNELS,
+    channels: Sequence[str] = CHANNELS,
 ) -> np.ndarray:
-    """GOSELO images of N robots: (N, C, 64, 64) uint8, 255 = occupied or visited `VISIT_CLIP` times.
+    """GOSELO images of N robots: (N, C, 64, 64) uint8.
 
-    Row 0 is the top (towards the goal), column 0 the left. Outside the map counts as occupied.
+    A channel is named after what it shows and its crop. `obstacles`: 255 where occupied, as everything outside the
+    map is. `visits`: 255 where the robot came `VISIT_CLIP` times. `clearance`: 255 at `CLEARANCE_CLIP` and beyond.
+    Row 0 is the top (towards the goal), column 0 the left.
+
+    Raises:
+        ValueError: a channel has another name.
     """
-    if channels not in (CHANNELS, LOCAL_CHANNELS):
-        raise ValueError(f"unknown GOSELO channels {channels}; known: {CHANNELS} and {LOCAL_CHANNELS}")
+    plan = [channel.rpartition("_")[::2] for channel in channels]
+    for channel, (source, crop) in zip(channels, plan, strict=True):
+        if source not in _SOURCES or crop not in _SIDES:
+            raise ValueError(f"GOSELO channel {channel!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
     out = np.empty((len(frame.position), len(channels), PIXELS, PIXELS), dtype=np.uint8)
     right = frame.right
     for row in range(len(out)):
-        length, up = frame.distance[row], frame.up[row]
-        levels = _pyramid(occupancy[row], visits[row])
-        middle = frame.position[row] + 0.5 * length * up
-        for crop, side in enumerate((length + MARGIN, 2.0 * length, 4.0 * length)):
-            both = _crop(levels, occupancy[row], middle, right[row], up, side)
-            out[row, crop], out[row, 3 + crop] = both[..., 0], both[..., 1]
-        if len(channels) > len(CHANNELS):
-            out[row, 6] = _crop(levels[:1], occupancy[row], frame.position[row], right[row], up, LOCAL_SIDE)[..., 0]
+        levels = {s: _pyramid(s, occupancy[row], visits[row]) for s in dict.fromkeys(source for source, _ in plan)}
+        length, up, here = float(frame.distance[row]), frame.up[row], frame.position[row]
+        for channel, (source, crop) in enumerate(plan):
+            center = here if crop == "local" else here + 0.5 * length * up
+            out[row, channel] = _crop(
+                levels[source],
+                occupancy[row],
+                center,
+                right[row],
+                up,
+                _SIDES[crop](length),
+                outside=255 if source == "obstacles" else 0,
+            )
     return out
 
 
-def _pyramid(occupancy: OccupancyMap, visits: VisitMap) -> list[np.ndarray]:
-    """Both maps as one two-channel image, then its means over 2 x 2, 4 x 4, ... pixels."""
-    level = np.empty((*occupancy.occupied.shape, 2), dtype=np.uint8)
-    np.multiply(occupancy.occupied, np.uint8(255), out=level[..., 0])
-    level[..., 1] = np.minimum(visits.counts, VISIT_CLIP) * (255 // VISIT_CLIP)
+_SOURCES = ("obstacles", "visits", "clearance")
+_SIDES = {
+    "1": lambda length: length + MARGIN,
+    "2": lambda length: 2.0 * length,
+    "4": lambda length: 4.0 * length,
+    "local": lambda length: LOCAL_SIDE,
+}
+
+
+def _pyramid(source: str, occupancy: OccupancyMap, visits: VisitMap) -> list[np.ndarray]:
+    """A map as an image (uint8), then its means over 2 x 2, 4 x 4, ... pixels.
+
+    What does not change while an occupancy map lives is kept with it.
+    """
+    if source == "visits":
+        return _halve(np.minimum(visits.counts, VISIT_CLIP) * np.uint8(255 // VISIT_CLIP), outside=0)
+    kept = occupancy.__dict__.setdefault("_pyramids", {})
+    if source not in kept:
+        if source == "obstacles":
+            kept[source] = _halve(occupancy.occupied.astype(np.uint8) * np.uint8(255), outside=255)
+        else:
+            scaled = np.minimum(occupancy.clearance * (255.0 / CLEARANCE_CLIP), 255.0)
+            kept[source] = [np.rint(scaled).astype(np.uint8)]
+    return kept[source]
+
+
+def _halve(level: np.ndarray, outside: int) -> list[np.ndarray]:
     levels = [level]
-    while min(level.shape[:2]) >= 16:
-        odd = level.shape[0] % 2, level.shape[1] % 2
-        if any(odd):
-            level = cv2.copyMakeBorder(level, 0, odd[0], 0, odd[1], cv2.BORDER_CONSTANT, value=(255, 0))
+    while min(level.shape) >= 16:
+        rows, cols = level.shape
+        if rows % 2 or cols % 2:
+            level = cv2.copyMakeBorder(level, 0, rows % 2, 0, cols % 2, cv2.BORDER_CONSTANT, value=outside)
         level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
         levels.append(level)
     return levels
@@ -117,23 +156,23 @@ def _crop(
     right: np.ndarray,
     up: np.ndarray,
     side: float,
+    outside: int,
 ) -> np.ndarray:
-    """A square of `side` [m] around `center`, turned so that `up` points to the top: (64, 64, 2) uint8."""
+    """A square of `side` [m] around `center`, turned so that `up` points to the top: (64, 64) uint8."""
     pixel = side / PIXELS
-    depth = int(np.clip(np.floor(np.log2(pixel / occupancy.resolution) + 1e-9), 0, len(levels) - 1))
+    depth = min(max(int(math.log2(pixel / occupancy.resolution) + 1e-9), 0), len(levels) - 1)
     step = occupancy.resolution * 2**depth
-    samples = max(1, int(np.ceil(pixel / step - 1e-6)))  # per pixel and axis, so that none of the level is skipped
+    samples = max(1, math.ceil(pixel / step - 1e-6))  # per pixel and axis, so that none of the level is skipped
     count, fine = PIXELS * samples, pixel / samples
     across, down = right * fine / step, -up * fine / step
     corner = center + (-side / 2 + fine / 2) * right + (side / 2 - fine / 2) * up
     offset = (corner - np.asarray(occupancy.origin)) / step - 0.5
-    matrix = np.array([[across[0], down[0], offset[0]], [across[1], down[1], offset[1]]])
     image = cv2.warpAffine(
         levels[depth],
-        matrix,
+        np.array([[across[0], down[0], offset[0]], [across[1], down[1], offset[1]]]),
         (count, count),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(255, 0),
+        borderValue=outside,
     )
     return image if samples == 1 else cv2.resize(image, (PIXELS, PIXELS), interpolation=cv2.INTER_AREA)

@@ -7,10 +7,11 @@ pass where there is not. With `soft_margin = 0` the cost is the length.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from hiernav.nav.occupancy import OccupancyMap
 
@@ -58,21 +59,25 @@ class PathField:
     def path_from(self, start: np.ndarray, max_vertices: int | None = None) -> np.ndarray | None:
         """Vertices (K, 2) from a start to the goal, both included; None if there is no path.
 
-        A start whose own cell is not traversable (too close to an obstacle) is led to the nearest cell that is.
-        With `max_vertices` the path ends early, at a cell on the way.
+        A start from whose own cell no path leads (too close to an obstacle) is led straight to the nearest cell from
+        which one does, unless an obstacle lies between. With `max_vertices` the path ends early, at a cell on the way.
         """
-        cell = self._entries()[self._cells(np.asarray(start)[None])[0]]
-        if cell < 0:
+        start = np.asarray(start, dtype=np.float64)
+        own = int(self._cells(start[None])[0])
+        cell = self._entry_for(start, own)
+        if cell is None:
             return None
         cells = [cell]
         limit = max_vertices or len(self._cost)
         while cell != self.goal_cell and len(cells) < limit:
             cell = self._next[cell]
             cells.append(cell)
-        vertices = self._centers[cells[1:] if len(cells) > 1 else cells]  # the first centre may lie behind the start
+        if len(cells) > 1 and cells[0] == own:
+            del cells[0]  # its centre may lie behind the start
+        vertices = self._centers[cells]
         if cell == self.goal_cell:
             vertices = np.concatenate([vertices[:-1], self.goal[None]])
-        return np.concatenate([np.asarray(start, dtype=np.float64)[None], vertices])
+        return np.concatenate([start[None], vertices])
 
     def line_cost(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Cost of straight lines: (M, 2), (M, 2) -> (M,) [m]; inf where the disc does not fit."""
@@ -122,6 +127,17 @@ class PathField:
         rows, cols = self._shape
         return np.clip(index[..., 1], 0, rows - 1) * cols + np.clip(index[..., 0], 0, cols - 1)
 
+    def _entry_for(self, start: np.ndarray, own: int) -> int | None:
+        """The cell at which a path from `start` (2,) in cell `own` begins, None if there is none."""
+        cell = int(self._entries()[own])
+        if cell == own or cell < 0:
+            return cell if cell >= 0 else None
+        length = float(np.linalg.norm(self._centers[cell] - start))
+        t = np.linspace(0.0, 1.0, 2 + int(2.0 * length / self.occupancy.resolution))[:, None]
+        met = self.occupancy.occupied_at((1.0 - t) * start + t * self._centers[cell])
+        # what the start itself stands in, by a pose a little wrong, may be left; nothing else may be crossed
+        return None if met[met.argmin() :].any() else cell
+
     def _entries(self) -> np.ndarray:
         """For every cell the nearest one from which the goal can be reached, -1 if there is none."""
         if self._entry is None:
@@ -144,8 +160,9 @@ def is_solvable(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, ra
     cells = [_nearest(centers, free, end) for end in ends]
     if cells[0] is None or cells[1] is None:
         return False
-    labels = connected_components(_grid_graph(free.reshape(shape), np.ones(shape)), directed=False)[1]
-    return bool(labels[cells[0]] == labels[cells[1]])
+    # where no corner is cut, cells joined by a diagonal are joined by two edges as well
+    _, labels = cv2.connectedComponents(free.reshape(shape).astype(np.uint8), connectivity=4)
+    return bool(labels.flat[cells[0]] == labels.flat[cells[1]])
 
 
 def resample(path: np.ndarray, count: int, spacing: float) -> np.ndarray:

@@ -196,7 +196,11 @@ class SkillTrainer:
                     evaluation = self.evaluations[-1]["reach_rate"] if self.evaluations else None
                     on_progress(
                         Progress(
-                            self.steps, skill.total_steps, self.learner.updates, rate, self._episodes.reach_rate,
+                            self.steps,
+                            skill.total_steps,
+                            self.learner.updates,
+                            rate,
+                            self._episodes.reach_rate,
                             evaluation,
                         )  # fmt: skip
                     )

@@ -49,3 +49,13 @@ def query_of(
     previous = np.full((len(where), 10, 2), np.nan) if previous is None else previous
     visits = [VisitMap(occupancy) for _ in where]
     return PlanQuery(where, np.asarray(goal, float), [occupancy] * len(where), visits, previous)
+
+
+def pillar_world(seed: int) -> tuple[np.ndarray, OccupancyMap, np.ndarray, np.ndarray]:
+    """Ten pillars in a field of 4 x 4 m, their map, and a start and a goal at which a disc of 0.1 m fits well."""
+    rng = np.random.default_rng(seed)
+    pillars = rng.uniform(-2.0, 2.0, (10, 2))
+    occupancy = map_with_pillars(pillars, (2.0, 2.0))
+    points = rng.uniform(-1.85, 1.85, (60, 2))
+    fit = points[np.linalg.norm(points[:, None] - pillars, axis=-1).min(axis=1) >= 0.33]
+    return pillars, occupancy, fit[0], fit[1]

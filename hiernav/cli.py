@@ -1,0 +1,322 @@
+"""The `hiernav` command. A sub-command imports what it needs when it runs.
+
+Exit codes: 0 done; 2 bad input, with one line that says what to do; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from hiernav.config import TrainConfig
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; returns the exit code."""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    try:
+        return arguments.run(arguments) or 0
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, OSError) as error:
+        print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("hiernav"):
+            raise
+        print(
+            f"hiernav {arguments.command}: needs {error.name}: install it with `pip install 'hiernav[train]'`",
+            file=sys.stderr,
+        )
+        return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    from hiernav import __version__
+
+    parser = argparse.ArgumentParser(
+        prog="hiernav", description="Plan with a waypoint network, move with a learned skill, deploy without torch."
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser(
+        "train",
+        help="train planner and skill into one run folder",
+        description="Train the planner, then the skill, into one run folder. Ctrl-C is safe: go on with --resume.",
+        epilog="Every value can be set as key.path=value, for example skill.total_steps=50000; "
+        "`hiernav config` lists them all.",
+    )
+    train.add_argument("--config", metavar="FILE", help="YAML with what differs from the defaults")
+    train.add_argument("--resume", metavar="RUN", help="go on with this run folder from its last checkpoints")
+    train.add_argument("--stage", choices=("planner", "skill", "all"), default="all", help="what to train (all)")
+    train.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
+    train.set_defaults(run=_train)
+
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="measure policies on worlds",
+        description="Drive policies through sampled worlds and report reach rate, steps, collisions and SPL.",
+    )
+    source = evaluate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--bundle", metavar="DIR", help="an exported bundle")
+    source.add_argument("--run", dest="run_path", metavar="RUN", help="a run folder")
+    evaluate.add_argument("--robot", help="fail unless the policies are for this robot")
+    evaluate.add_argument(
+        "--world", action="append", metavar="WORLD", help="a world; repeat for several (pillar(2,2,10))"
+    )
+    evaluate.add_argument(
+        "--protocol", choices=("paper", "strict"), default="strict", help="how to count (strict: 1000 episodes)"
+    )
+    evaluate.add_argument("--planner", choices=("cnn", "astar"), default="cnn", help="who plans (cnn)")
+    evaluate.add_argument(
+        "--no-repair", action="store_true", help="drive the network's plans even if they collide (cnn only)"
+    )
+    evaluate.add_argument("--episodes", type=int, metavar="N", help="per world (protocol's number)")
+    evaluate.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
+    evaluate.add_argument("--json", metavar="FILE", help="write the results, an object per world; - for the screen")
+    evaluate.set_defaults(run=_evaluate)
+
+    export = commands.add_parser(
+        "export",
+        help="turn a run into a bundle of ONNX files",
+        description="Export a run's planner and skill, with all they assume, to a verified bundle.",
+    )
+    export.add_argument("--run", dest="run_path", metavar="RUN", required=True, help="a run folder")
+    export.add_argument("--onnx", metavar="DIR", required=True, help="bundle folder to write; replaced if it exists")
+    export.set_defaults(run=_export)
+
+    world = commands.add_parser(
+        "world", help="draw a world", description="Sample a world from a seed and draw it, or print it as JSON."
+    )
+    world.add_argument("--kind", default="pillar(2,2,10)", metavar="WORLD", help="which world (pillar(2,2,10))")
+    world.add_argument("--seed", type=int, default=0, help="decides the layout (0)")
+    world.add_argument("--radius", type=float, default=0.1, help="of the robot it must be solvable for [m] (0.1)")
+    world.add_argument("--png", metavar="FILE", help="picture to write")
+    world.add_argument("--json", action="store_true", help="print the layout as JSON")
+    world.set_defaults(run=_world)
+
+    config = commands.add_parser(
+        "config",
+        help="list every setting",
+        description="List every setting with its default, or print a resolved configuration as YAML.",
+    )
+    config.add_argument("--config", metavar="FILE", help="resolve this file instead of listing the settings")
+    config.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
+    config.set_defaults(run=_config)
+    return parser
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from hiernav.config import load_config
+    from hiernav.run import Run, RunError
+
+    if arguments.resume:
+        if arguments.config or arguments.overrides:
+            raise RunError("--resume takes its configuration from the run folder: leave out --config and KEY=VALUE")
+        run = Run.open(arguments.resume)
+    else:
+        config = load_config(arguments.config, arguments.overrides)
+        _check_worlds(config)
+        _need_training_packages()
+        run = Run.create(config)
+    from hiernav.training import train
+
+    print(f"run folder: {run.path}")
+    try:
+        with _progress() as progress:
+            train(run, arguments.stage, progress)
+    except KeyboardInterrupt:
+        print(f"stopped; go on from the last checkpoint with: hiernav train --resume {run.path}", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        run.close()
+    print(f"done; export with: hiernav export --run {run.path} --onnx BUNDLE")
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from hiernav.evaluate import EPISODES, evaluate, open_policies
+    from hiernav.sim.layout import parse_world
+
+    worlds = [parse_world(text) for text in arguments.world or ["pillar(2,2,10)"]]
+    policies = open_policies(arguments.bundle or arguments.run_path)
+    robot = policies.config.robot
+    if arguments.robot and arguments.robot != robot:
+        raise ValueError(f"these policies are for robot {robot!r}, not {arguments.robot!r}")
+    count = EPISODES[arguments.protocol] if arguments.episodes is None else arguments.episodes
+    with _progress() as progress:
+        tasks = {str(world): progress.add_task(str(world), total=count, note="") for world in worlds}
+        reached = dict.fromkeys(tasks, 0)
+
+        def show(world: str, _: int, episode: Any) -> None:
+            reached[world] += episode.reached
+            progress.advance(tasks[world])
+            done = progress.tasks[tasks[world]].completed
+            progress.update(tasks[world], note=f"reach {reached[world] / done:.3f}")
+
+        results = evaluate(
+            policies,
+            worlds,
+            arguments.protocol,
+            arguments.planner,
+            arguments.episodes,
+            arguments.seed,
+            repair=not arguments.no_repair,
+            on_episode=show,
+        )
+    if arguments.json == "-":
+        print(json.dumps(results, indent=2))
+    else:
+        _print_results(results)
+        if arguments.json:
+            _write_json(Path(arguments.json), results)
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from hiernav.export import export_run
+
+    out = export_run(arguments.run_path, arguments.onnx)
+    total = sum(file.stat().st_size for file in out.iterdir())
+    print(f"{out}: {', '.join(sorted(file.name for file in out.iterdir()))}; {total / 1e6:.2f} MB, checked")
+    return 0
+
+
+def _world(arguments: argparse.Namespace) -> int:
+    from hiernav.sim.layout import parse_world
+    from hiernav.sim.worlds import sample_layout
+
+    layout = sample_layout(parse_world(arguments.kind), arguments.seed, arguments.radius)
+    if arguments.json or not arguments.png:
+        shown = {
+            "world": str(layout.spec),
+            "seed": layout.seed,
+            "start": layout.start.tolist(),
+            "goal": layout.goal.tolist(),
+            "pillars": layout.pillars.tolist(),
+            "gremlins": layout.gremlins.tolist(),
+            "walls": layout.walls.tolist(),
+            "max_steps": layout.spec.max_steps,
+            "redraws": layout.redraws,
+        }
+        print(json.dumps(shown, indent=2))
+    if arguments.png:
+        from hiernav.draw import draw_layout
+
+        draw_layout(layout, Path(arguments.png))
+        print(f"wrote {arguments.png}", file=sys.stderr if arguments.json else sys.stdout)
+    return 0
+
+
+def _config(arguments: argparse.Namespace) -> int:
+    from hiernav.config import describe_config, dump_config, load_config
+
+    if arguments.config or arguments.overrides:
+        print(dump_config(load_config(arguments.config, arguments.overrides)), end="")
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("key", "type", "default", "what it is", box=None, pad_edge=False)
+    for setting in describe_config():
+        table.add_row(setting.path, setting.type, str(setting.default), setting.description)
+    Console().print(table)
+    return 0
+
+
+def _check_worlds(config: TrainConfig) -> None:
+    """Refuse worlds that cannot be built before anything is written."""
+    from hiernav.config import ConfigError
+    from hiernav.sim.layout import parse_world
+
+    for key, texts in (("planner.worlds", config.planner.worlds), ("skill.world", (config.skill.world,))):
+        for text in texts:
+            try:
+                parse_world(text)
+            except ValueError as error:
+                raise ConfigError(f"{key} = {text!r}: {error}") from None
+
+
+def _need_training_packages() -> None:
+    """Fail before a run folder is made when the training extra is not installed."""
+    import tensorboard  # noqa: F401
+    import torch  # noqa: F401
+    import torchrl  # noqa: F401
+
+
+def _print_results(results: dict[str, dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    first = next(iter(results.values()))
+    title = f"{first['robot']}, {first['planner']} planner, {first['protocol']} protocol, seed {first['seed']}"
+    table = Table(title=title)
+    for column in ("world", "episodes", "reach rate", "95 %", "steps", "collisions", "collision-free", "SPL"):
+        table.add_column(column, justify="left" if column == "world" else "right")
+    for name, row in results.items():
+        low, high = row["reach_ci95"]
+        table.add_row(
+            name,
+            str(row["episodes"]),
+            f"{row['reach_rate']:.3f}",
+            f"{low:.3f} - {high:.3f}",
+            f"{row['steps_mean']:.1f}",
+            f"{row['collisions_mean']:.2f}",
+            f"{row['collision_free_rate']:.3f}",
+            f"{row['spl_mean']:.3f}",
+        )
+    console = Console()
+    console.print(table)
+    for name, row in results.items():
+        replans = ", ".join(f"{reason} {count}" for reason, count in row["replans"].items())
+        checked = f"; {row['repairs']} of {row['proposals']} plans repaired" if "repairs" in row else ""
+        console.print(f"{name}: plans ended by {replans}{checked}", style="dim", highlight=False)
+
+
+def _write_json(path: Path, value: Any) -> None:
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps(value, indent=2) + "\n")
+    partial.replace(path)
+
+
+def _progress() -> Progress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=False),
+        TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,206 @@
+"""Evaluation of a pair of policies on any list of worlds, under the paper's protocol or the strict one.
+
+`paper`: 200 episodes; contacts with gremlins do not count as collisions.
+`strict`: 1000 episodes; every contact counts.
+Under both, leaving the field and reaching the cap are failures, and a failure counts the cap as its steps.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hiernav.config import OptionConfig, PlannerConfig, TrainConfig
+from hiernav.nav.bundle import load_bundle
+from hiernav.nav.option import Planner, Skill, TerminationReason
+from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
+from hiernav.runtime.policy import OnnxPlannerNetwork, OnnxSkill
+from hiernav.sim.factory import expert_planner, make_task
+from hiernav.sim.layout import WorldSpec, parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.sim.rollout import Episode, run_episodes
+from hiernav.sim.worlds import sample_layout
+
+EPISODES = {"paper": 200, "strict": 1000}
+_Z95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Policies:
+    """A planner network and a skill, and the configuration they were trained under."""
+
+    config: TrainConfig
+    skill: Skill
+    network: Network | None
+    channels: tuple[str, ...] = ()
+
+
+def open_policies(path: str | Path) -> Policies:
+    """Policies of a bundle (ONNX Runtime) or of a run folder (torch).
+
+    Raises:
+        ValueError: the folder is neither, or is incomplete (BundleError, RunError).
+    """
+    path = Path(path)
+    return _from_run(path) if (path / "config.yaml").exists() else _from_bundle(path)
+
+
+def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:
+    """A planner for evaluation.
+
+    Args:
+        kind: "cnn" (the trained network) or "astar" (the expert).
+        repair: whether plans of the network that collide are replaced by the expert's.
+    """
+    expert = expert_planner(policies.config)
+    if kind == "astar":
+        return expert
+    if kind != "cnn":
+        raise ValueError(f"unknown planner {kind!r}; known: cnn, astar")
+    if policies.network is None:
+        raise ValueError("these policies hold no planner network: train the planner first, or use --planner astar")
+    proposer = GoseloPlanner(policies.network, policies.channels, expert.radius)
+    return VerifiedPlanner(proposer, expert, get_robot(policies.config.robot).radius) if repair else proposer
+
+
+def evaluate(
+    policies: Policies,
+    worlds: Sequence[WorldSpec],
+    protocol: str = "strict",
+    planner: str = "cnn",
+    episodes: int | None = None,
+    seed: int = 0,
+    repair: bool = True,
+    rows: int = 64,
+    on_episode: Callable[[str, int, Episode], None] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Metrics of every world, by its name; the same for the same seed, whatever `rows` is.
+
+    Args:
+        protocol: "paper" or "strict".
+        planner: "cnn" or "astar".
+        episodes: per world; 200 (paper) or 1000 (strict) by default.
+        repair: see `make_planner`.
+        rows: simulations side by side.
+    """
+    if protocol not in EPISODES:
+        raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(EPISODES)}")
+    count = EPISODES[protocol] if episodes is None else episodes
+    if count < 1:
+        raise ValueError(f"episodes must be at least 1, got {count}")
+    results = {}
+    for world in worlds:
+        name = str(world)
+        plan = make_planner(policies, planner, repair)
+        radius = get_robot(policies.config.robot).radius
+        layouts = [sample_layout(world, int(s), radius) for s in episode_seeds(seed, count)]
+        task = make_task(policies.config, min(rows, count), plan, [world])
+        began = time.perf_counter()
+        done = run_episodes(
+            task, policies.skill, layouts, None if on_episode is None else lambda k, e, n=name: on_episode(n, k, e)
+        )
+        if protocol == "paper" and world.kind == "gremlin":
+            for episode in done:
+                episode.collisions = 0
+        results[name] = {
+            "world": name,
+            "robot": policies.config.robot,
+            "protocol": protocol,
+            "planner": planner,
+            "seed": seed,
+            **summarize(done),
+            **_plan_counts(plan),
+            "redraws": sum(layout.redraws for layout in layouts),
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+    return results
+
+
+def episode_seeds(seed: int, count: int) -> np.ndarray:
+    """World seeds of an evaluation: (count,), the first ones the same for every count."""
+    return np.random.SeedSequence((seed, 0xE9A1)).generate_state(count)
+
+
+def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Metrics of finished episodes."""
+    reached = np.array([e.reached for e in episodes])
+    collisions = np.array([e.collisions for e in episodes])
+    reasons = [r.name.lower() for r in TerminationReason if r != TerminationReason.NONE]
+    return {
+        "episodes": len(episodes),
+        "reach_rate": float(reached.mean()),
+        "reach_ci95": list(wilson_interval(int(reached.sum()), len(episodes))),
+        "steps_mean": float(np.mean([e.steps_counted for e in episodes])),
+        "collisions_mean": float(collisions.mean()),
+        "collision_free_rate": float((reached & (collisions == 0)).mean()),
+        "spl_mean": float(np.nanmean([e.spl for e in episodes])),
+        "return_mean": float(np.mean([e.return_ for e in episodes])),
+        "replans": {reason: sum(e.replans[reason] for e in episodes) for reason in reasons},
+        "endings": {kind: sum(e.reason == kind for e in episodes) for kind in sorted({e.reason for e in episodes})},
+        "refused": sum(e.refused for e in episodes),
+    }
+
+
+def wilson_interval(successes: int, trials: int, z: float = _Z95) -> tuple[float, float]:
+    """Wilson score interval of a rate (95 % by default)."""
+    if trials < 1:
+        raise ValueError(f"trials must be at least 1, got {trials}")
+    rate, z2 = successes / trials, z * z / trials
+    middle = (rate + z2 / 2) / (1 + z2)
+    half = z * np.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials)) / (1 + z2)
+    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+
+
+def _plan_counts(planner: Planner) -> dict[str, int]:
+    if isinstance(planner, VerifiedPlanner):
+        return {"proposals": planner.proposals, "repairs": planner.repairs, "refusals": planner.refusals}
+    return {}
+
+
+def _from_bundle(path: Path) -> Policies:
+    bundle = load_bundle(path)
+    manifest = bundle.manifest
+    config = TrainConfig(
+        robot=manifest.robot,
+        planner=PlannerConfig(
+            planning_radius_m=manifest.plan.planning_radius_m, soft_margin_m=manifest.plan.soft_margin_m
+        ),
+        option=OptionConfig(
+            d_update_m=manifest.replan.d_update_m,
+            half_fraction=manifest.replan.half_fraction,
+            invalid=manifest.replan.invalid,
+            waypoints=manifest.plan.waypoints,
+            spacing_m=manifest.plan.spacing_m,
+        ),
+    )
+    network = OnnxPlannerNetwork(bundle.planner)
+    return Policies(config, OnnxSkill(bundle.skill), network, tuple(manifest.goselo.channels))
+
+
+def _from_run(path: Path) -> Policies:
+    from hiernav.planner.network import TorchNetwork
+    from hiernav.planner.train import load_network
+    from hiernav.run import Run, RunError
+    from hiernav.skill.train import TorchSkill, load_actor
+
+    run = Run.open(path)
+    skill, planner = run.load("skill"), run.load("planner")
+    if skill is None:
+        raise RunError(f"{path} has no trained skill yet: go on with `hiernav train --resume {path}`")
+    network = None if planner is None else load_network(run.config, planner)
+    return Policies(
+        run.config,
+        TorchSkill(load_actor(run.config, skill)),
+        None if network is None else TorchNetwork(network),
+        () if network is None else tuple(network.channels),
+    )
+
+
+def parse_worlds(texts: Sequence[str]) -> list[WorldSpec]:
+    """World specifications of a list of names."""
+    return [parse_world(text) for text in texts]

@@ -1,0 +1,208 @@
+"""Export of a run's policies to a bundle of ONNX files.
+
+Normalisation and action scaling are inside the graphs: they take raw observations and give actions in [-1, 1].
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from hiernav import __version__
+from hiernav.config import TrainConfig
+from hiernav.nav import goselo
+from hiernav.nav.bundle import (
+    PLANNER,
+    SKILL,
+    GoseloSpec,
+    Manifest,
+    ObservationField,
+    PlannerSpec,
+    PlanSpec,
+    ReplanSpec,
+    SkillSpec,
+    TensorSpec,
+    file_sha256,
+    load_bundle,
+    write_golden,
+    write_manifest,
+)
+from hiernav.nav.observation import ObservationLayout
+from hiernav.nav.occupancy import RESOLUTION
+from hiernav.planner.network import HypothesisNetwork, PaperNetwork
+from hiernav.planner.train import load_network, torch_planner
+from hiernav.run import Run, RunError
+from hiernav.runtime.policy import check_golden
+from hiernav.sim.factory import make_task
+from hiernav.sim.robots import get_robot
+from hiernav.skill.networks import Actor
+from hiernav.skill.train import TorchSkill, load_actor, skill_layout
+
+OPSET = 18
+GOLDEN_SAMPLES = 32
+PROVENANCE_FILE = "summary.json"
+
+
+class _MeanAction(nn.Module):
+    def __init__(self, actor: Actor) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return self.actor.mean_action(observation)
+
+
+def export_run(run_path: str | Path, out: str | Path) -> Path:
+    """Export the trained pair of a run folder.
+
+    Args:
+        run_path: run folder with a finished planner and skill.
+        out: bundle folder; it is replaced as a whole, and only by a bundle that has been loaded and checked.
+
+    Raises:
+        RunError: the run has no trained planner or skill.
+    """
+    run = Run.open(run_path)
+    states = {stage: run.load(stage) for stage in ("planner", "skill")}
+    for stage, state in states.items():
+        if state is None:
+            raise RunError(f"{run.path} has no trained {stage} yet: go on with `hiernav train --resume {run.path}`")
+    network = load_network(run.config, states["planner"])  # type: ignore[arg-type]
+    actor = load_actor(run.config, states["skill"])  # type: ignore[arg-type]
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".bundle-") as temporary:
+        folder = Path(temporary) / "bundle"
+        folder.mkdir()
+        write_bundle(folder, run.config, network, actor, _provenance(run, states))
+        if out.exists():
+            shutil.rmtree(out)
+        shutil.move(folder, out)
+    return out
+
+
+def write_bundle(
+    folder: Path,
+    config: TrainConfig,
+    network: PaperNetwork | HypothesisNetwork,
+    actor: Actor,
+    provenance: dict[str, str | int | float],
+) -> None:
+    """Write and check all files of a bundle in an empty folder."""
+    robot, layout = get_robot(config.robot), skill_layout(config)
+    golden = record_inputs(config, network, actor, GOLDEN_SAMPLES)
+    network, mean_action = network.eval(), _MeanAction(actor).eval()
+    _export(
+        network, (golden["image"], golden["distance"]), ("image", "distance"), ("waypoints", "scores"), folder / PLANNER
+    )
+    _export(mean_action, (golden["observation"],), ("observation",), ("action",), folder / SKILL)
+    with torch.no_grad():
+        waypoints, scores = network(torch.from_numpy(golden["image"]), torch.from_numpy(golden["distance"]))
+        golden["action"] = mean_action(torch.from_numpy(golden["observation"])).numpy()
+    golden["waypoints"], golden["scores"] = waypoints.numpy(), scores.numpy()
+    write_golden(folder, golden)
+    option, planner = config.option, config.planner
+    write_manifest(
+        folder,
+        Manifest(
+            robot=robot.name,
+            robot_sha256=file_sha256(robot.xml_path),
+            control_period_s=robot.control_period,
+            map_resolution_m=RESOLUTION,
+            planner=PlannerSpec(
+                inputs=(_spec("image", golden), _spec("distance", golden)),
+                outputs=(_spec("waypoints", golden), _spec("scores", golden)),
+                preset=planner.preset,
+                channels=len(network.channels),
+            ),
+            skill=SkillSpec(inputs=(_spec("observation", golden),), outputs=(_spec("action", golden),)),
+            observation=_fields(layout),
+            goselo=GoseloSpec(pixels=goselo.PIXELS, channels=tuple(network.channels), local_side_m=goselo.LOCAL_SIDE),
+            plan=PlanSpec(
+                waypoints=option.waypoints,
+                spacing_m=option.spacing_m,
+                planning_radius_m=planner.planning_radius_m or robot.radius,
+                soft_margin_m=planner.soft_margin_m,
+            ),
+            replan=ReplanSpec(d_update_m=option.d_update_m, half_fraction=option.half_fraction, invalid=option.invalid),
+            provenance=provenance,
+        ),
+    )
+    check_golden(load_bundle(folder))
+
+
+def record_inputs(
+    config: TrainConfig, network: PaperNetwork | HypothesisNetwork, actor: Actor, count: int
+) -> dict[str, np.ndarray]:
+    """Inputs of both networks recorded while they drive: observation (count, D), image, distance."""
+    planner = torch_planner(network, config.planner.planning_radius_m or get_robot(config.robot).radius)
+    images: list[np.ndarray] = []
+    distances: list[np.ndarray] = []
+    inner = planner.network
+
+    def recording(image: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        images.append(image)
+        distances.append(distance)
+        return inner(image, distance)
+
+    planner.network = recording
+    task = make_task(config, 8, planner)
+    task.reset()
+    skill, observations = TorchSkill(actor), []
+    while sum(map(len, images)) < count or len(observations) * 8 < count:
+        observations.append(task.observation)
+        step = task.step(skill(task.observation))
+        ended = np.flatnonzero(step.terminated | step.truncated)
+        if len(ended):
+            task.reset(ended)
+    return {
+        "observation": np.concatenate(observations)[:count],
+        "image": np.concatenate(images)[:count],
+        "distance": np.concatenate(distances)[:count],
+    }
+
+
+def _export(
+    module: nn.Module, inputs: tuple[np.ndarray, ...], names: tuple[str, ...], outputs: tuple[str, ...], file: Path
+) -> None:
+    batch = torch.export.Dim("batch", min=1, max=65536)
+    torch.onnx.export(
+        module,
+        tuple(torch.from_numpy(value) for value in inputs),
+        str(file),
+        input_names=list(names),
+        output_names=list(outputs),
+        dynamic_shapes=tuple({0: batch} for _ in inputs),
+        opset_version=OPSET,
+        external_data=False,
+        dynamo=True,
+        verbose=False,
+    )
+
+
+def _spec(name: str, golden: dict[str, np.ndarray]) -> TensorSpec:
+    return TensorSpec(name=name, shape=(None, *golden[name].shape[1:]), dtype=str(golden[name].dtype))
+
+
+def _fields(layout: ObservationLayout) -> tuple[ObservationField, ...]:
+    return tuple(ObservationField(name=t.name, size=t.size, unit=t.unit, scale=t.scale) for t in layout.terms)
+
+
+def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
+    best = max(states["skill"]["evaluations"], key=lambda e: e["reach_rate"])
+    return {
+        "hiernav": __version__,
+        "torch": torch.__version__.split("+")[0],
+        "seed": run.config.seed,
+        "skill_steps": int(states["skill"]["steps"]),
+        "skill_updates": int(states["skill"]["learner"]["updates"]),
+        "skill_reach_rate": float(best["reach_rate"]),
+        "planner_samples": run.config.planner.samples,
+        "planner_epochs": int(states["planner"]["epoch"]),
+        "planner_error_m": round(float(states["planner"]["validation"]["error"]), 5),
+    }

@@ -1,0 +1,1 @@
+"""The waypoint generator: data set, network, training (torch)."""

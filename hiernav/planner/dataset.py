@@ -1,0 +1,162 @@
+"""Labelled samples for the waypoint generator (paper section IV-A).
+
+One shortest-path field per world labels every start in it. Half of the starts lie anywhere in the field, close to
+obstacles too; the other half lie on the way from such a start to the goal, with the visits made so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from hiernav.nav import goselo
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.search import PathField, random_shortcuts, resample
+from hiernav.sim.layout import WorldSpec, parse_world
+from hiernav.sim.worlds import sample_layout
+
+_WORLDS_PER_TASK = 8
+_MIN_CLEARANCE = 0.03
+"""Starts keep at least this far from obstacles [m]: a robot in contact is about there."""
+_OFF_PATH = 0.1
+"""Standard deviation of starts around the path [m]."""
+
+
+@dataclass(frozen=True)
+class LabelSettings:
+    """How labels are made."""
+
+    worlds: tuple[str, ...]
+    radius: float
+    soft_margin: float
+    waypoints: int = 10
+    spacing: float = 0.1
+    samples_per_world: int = 100
+    random_smoothing: bool = False
+    """The paper's random shortcuts instead of the longest straight lines."""
+    channels: tuple[str, ...] = goselo.METRIC_CHANNELS
+
+
+@dataclass
+class Samples:
+    """Network inputs and labels in the GOSELO frame."""
+
+    image: np.ndarray
+    """(S, C, 64, 64) uint8."""
+    clearance: np.ndarray
+    """(S, 64, 64) uint8, `clearance_local` crop for the penalty on waypoints near obstacles."""
+    distance: np.ndarray
+    """(S,) float32, L [m]."""
+    label: np.ndarray
+    """(S, K, 2) float32, right and up of the robot [m]."""
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def make_samples(
+    settings: LabelSettings,
+    count: int,
+    seed: Sequence[int],
+    processes: int = 1,
+    on_progress: Callable[[int], None] | None = None,
+) -> Samples:
+    """Draw worlds and label starts in them; the result depends on the seed alone, not on `processes`."""
+    worlds = -(-count // settings.samples_per_world)
+    tasks = [
+        (settings, tuple(seed), first, min(_WORLDS_PER_TASK, worlds - first))
+        for first in range(0, worlds, _WORLDS_PER_TASK)
+    ]
+    channels, waypoints = len(settings.channels), settings.waypoints
+    samples = Samples(
+        np.empty((count, channels, goselo.PIXELS, goselo.PIXELS), dtype=np.uint8),
+        np.empty((count, goselo.PIXELS, goselo.PIXELS), dtype=np.uint8),
+        np.empty(count, dtype=np.float32),
+        np.empty((count, waypoints, 2), dtype=np.float32),
+    )
+    done = 0
+
+    def store(part: Samples) -> None:
+        nonlocal done
+        keep = min(len(part), count - done)
+        for name in ("image", "clearance", "distance", "label"):
+            getattr(samples, name)[done : done + keep] = getattr(part, name)[:keep]
+        done += keep
+        if on_progress is not None:
+            on_progress(done)
+
+    if processes > 1:
+        with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
+            for part in pool.map(_label_worlds, *zip(*tasks, strict=True)):
+                store(part)
+    else:
+        for task in tasks:
+            store(_label_worlds(*task))
+    return samples
+
+
+def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:
+    """`count` samples of one world."""
+    rng = np.random.default_rng(np.random.SeedSequence((seed, 0x1ABE1)))
+    layout = sample_layout(spec, seed, settings.radius)
+    occupancy = layout.occupancy(0.0)
+    field = PathField(occupancy, layout.goal, settings.radius, settings.soft_margin)
+    starts, labels, visits = [], [], []
+    fresh = VisitMap(occupancy)
+    while len(starts) < count:
+        start, seen = _random_start(occupancy, rng), fresh
+        if len(starts) % 2:
+            path = field.waypoints(start, 80, 0.05)
+            if path is None:
+                continue
+            reached = rng.integers(len(path))
+            start = path[reached] + rng.normal(0.0, _OFF_PATH, 2)
+            if not occupancy.clearance_at(start) > _MIN_CLEARANCE:
+                continue
+            seen = VisitMap(occupancy)
+            seen.add(path[: reached + 1])
+        label = _label(field, start, settings, rng)
+        if label is None:
+            continue
+        starts.append(start)
+        labels.append(label)
+        visits.append(seen)
+    frame = goselo.GoseloFrame.of(np.array(starts), np.broadcast_to(layout.goal, (count, 2)))
+    image = goselo.images([occupancy] * count, visits, frame, settings.channels)
+    if "clearance_local" in settings.channels:
+        clearance = image[:, settings.channels.index("clearance_local")]
+    else:
+        clearance = goselo.images([occupancy] * count, visits, frame, ("clearance_local",))[:, 0]
+    label = frame.from_world(np.array(labels)).astype(np.float32)
+    return Samples(image, clearance, frame.distance.astype(np.float32), label)
+
+
+def _label(field: PathField, start: np.ndarray, settings: LabelSettings, rng: np.random.Generator) -> np.ndarray | None:
+    if not settings.random_smoothing:
+        return field.waypoints(start, settings.waypoints, settings.spacing)
+    path = field.path_from(start)
+    if path is None:
+        return None
+    return resample(random_shortcuts(path, field, rng), settings.waypoints, settings.spacing)
+
+
+def _random_start(occupancy: OccupancyMap, rng: np.random.Generator) -> np.ndarray:
+    xmin, xmax, ymin, ymax = occupancy.extent
+    while True:
+        points = rng.uniform((xmin, ymin), (xmax, ymax), (16, 2))
+        free = np.flatnonzero(occupancy.clearance_at(points) > _MIN_CLEARANCE)
+        if len(free):
+            return points[free[0]]
+
+
+def _label_worlds(settings: LabelSettings, seed: tuple[int, ...], first: int, worlds: int) -> Samples:
+    parts = []
+    for number in range(first, first + worlds):
+        which, world_seed = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(2)
+        spec = parse_world(settings.worlds[which % len(settings.worlds)])
+        parts.append(label_world(settings, spec, int(world_seed), settings.samples_per_world))
+    return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in Samples.__dataclass_fields__))

@@ -1,0 +1,240 @@
+"""Training of the waypoint generator on labels of the shortest-path planner."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from hiernav.config import TrainConfig
+from hiernav.nav import goselo
+from hiernav.nav.planners import GoseloPlanner
+from hiernav.planner.dataset import LabelSettings, Samples, make_samples
+from hiernav.planner.network import HypothesisNetwork, PaperNetwork, TorchNetwork, make_network
+from hiernav.run import Run
+from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.sim.walk import walk
+from hiernav.sim.worlds import sample_layout
+
+_VALIDATION = 2000
+_VALIDATION_SEED = 0xE7A1
+_WALKS = 200
+_OTHER_HYPOTHESES = 0.05
+"""Share of the loss that hypotheses which are not the best one keep, so that none dies."""
+
+
+@dataclass
+class Progress:
+    """What a progress display may want to show."""
+
+    stage: str
+    done: int
+    total: int
+    loss: float
+    error: float | None
+    """Mean distance of the chosen waypoints from the label on validation worlds [m]."""
+
+
+class PlannerTrainer:
+    """One training of the waypoint generator within a run folder; checkpointed after every epoch."""
+
+    def __init__(self, config: TrainConfig, run: Run) -> None:
+        self.config, self.run = config, run
+        planner = config.planner
+        radius = planner.planning_radius_m or get_robot(config.robot).radius
+        seed = np.random.SeedSequence((config.seed, 3)).generate_state(1)
+        torch.manual_seed(int(seed[0]))
+        self.network = make_network(
+            planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
+        )
+        self.labels = LabelSettings(
+            worlds=planner.worlds,
+            radius=radius,
+            soft_margin=planner.soft_margin_m,
+            waypoints=config.option.waypoints,
+            spacing=config.option.spacing_m,
+            samples_per_world=planner.samples_per_world,
+            random_smoothing=planner.preset == "paper",
+            channels=self.network.channels,
+        )
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=planner.learning_rate, weight_decay=planner.weight_decay
+        )
+        batches = -(-planner.samples // planner.batch_size)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimizer, planner.learning_rate, total_steps=planner.epochs * batches, pct_start=0.1
+        )
+        self.epoch = 0
+        self.validation: dict[str, float] = {}
+
+    def resume(self) -> int | None:
+        """Go back to the last checkpoint; its number of epochs, or None if there is none."""
+        state = self.run.load("planner", rewind=True)
+        if state is None:
+            return None
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.schedule.load_state_dict(state["schedule"])
+        torch.set_rng_state(state["torch_rng"])
+        self.epoch, self.validation = state["epoch"], state["validation"]
+        return self.epoch
+
+    @property
+    def finished(self) -> bool:
+        return self.epoch >= self.config.planner.epochs
+
+    def train(self, on_progress: Callable[[Progress], None] | None = None) -> None:
+        """Make the data set, train all epochs, and measure collisions of the waypoints."""
+        if self.finished:
+            return
+        planner, seed = self.config.planner, self.config.seed
+
+        def report(stage: str, done: int, total: int, loss: float = float("nan")) -> None:
+            if on_progress is not None:
+                on_progress(Progress(stage, done, total, loss, self.validation.get("error")))
+
+        samples = make_samples(
+            self.labels,
+            planner.samples,
+            (seed, 4),
+            self.config.threads,
+            lambda done: report("data set", done, planner.samples),
+        )
+        held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
+        total = planner.epochs * planner.samples
+        while not self.finished:
+            loss = self._epoch(samples, lambda done, now: report("training", done, total, now))
+            self.epoch += 1
+            self.validation = {"loss": loss, **self._validate(held_out)}
+            if self.finished:
+                self.validation |= self._walk()
+            self.run.log("planner", self.epoch, self.validation)
+            self._save()
+
+    def _epoch(self, samples: Samples, on_batch: Callable[[int, float], None]) -> float:
+        self.network.train()
+        planner, total, began = self.config.planner, 0.0, time.perf_counter()
+        order = torch.randperm(len(samples)).numpy()
+        for first in range(0, len(order), planner.batch_size):
+            rows = np.sort(order[first : first + planner.batch_size])
+            batch = _tensors(samples, rows)
+            if planner.mirror:
+                batch = _mirror(batch, torch.rand(len(rows)) < 0.5)
+            loss = plan_loss(self.network, *batch, self._margin, planner.clearance_weight)
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+            self.optimizer.step()
+            self.schedule.step()
+            total += float(loss.detach()) * len(rows)
+            if time.perf_counter() - began > 0.2:
+                began = time.perf_counter()
+                on_batch(self.epoch * len(order) + first, total / (first + len(rows)))
+        return total / len(order)
+
+    @property
+    def _margin(self) -> float:
+        """Clearance that waypoints are pushed to [m]."""
+        return self.labels.radius + 0.3 * self.labels.soft_margin
+
+    @torch.no_grad()
+    def _validate(self, samples: Samples) -> dict[str, float]:
+        self.network.eval()
+        errors, hits = [], []
+        for first in range(0, len(samples), 500):
+            image, clearance, distance, label = _tensors(samples, np.arange(first, min(first + 500, len(samples))))
+            waypoints, scores = self.network(image, distance)
+            chosen = waypoints[torch.arange(len(label)), scores.argmax(dim=1)]
+            errors.append((chosen - label).norm(dim=-1).mean(dim=-1))
+            hits.append((clearance_at(clearance, chosen[:, None])[:, 0] < self.labels.radius).float().mean(dim=-1))
+        return {"error": float(torch.cat(errors).mean()), "blocked_waypoints": float(torch.cat(hits).mean())}
+
+    def _walk(self) -> dict[str, float]:
+        spec = parse_world(self.config.planner.worlds[0])
+        seeds = np.random.SeedSequence((self.config.seed, _VALIDATION_SEED, 1)).generate_state(_WALKS)
+        layouts = [sample_layout(spec, int(seed), self.labels.radius) for seed in seeds]
+        result = walk(torch_planner(self.network, self.labels.radius), layouts, self.labels.radius)
+        return {
+            "walk_collisions": float(result.collisions.mean()),
+            "walk_reach_rate": float(result.reached.mean()),
+        }
+
+    def _save(self) -> None:
+        self.run.save(
+            "planner",
+            {
+                "network": self.network.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "schedule": self.schedule.state_dict(),
+                "torch_rng": torch.get_rng_state(),
+                "epoch": self.epoch,
+                "validation": self.validation,
+            },
+        )
+
+
+def plan_loss(
+    network: PaperNetwork | HypothesisNetwork,
+    image: torch.Tensor,
+    clearance: torch.Tensor,
+    distance: torch.Tensor,
+    label: torch.Tensor,
+    margin: float,
+    clearance_weight: float,
+) -> torch.Tensor:
+    """Loss of a batch (B,): squared distance of the best hypothesis, its score, and a lack of clearance.
+
+    With one hypothesis and `clearance_weight` 0 this is the paper's loss (Eq. 1), times ten.
+    """
+    waypoints, scores = network(image, distance)
+    squared = (waypoints - label[:, None]).square().sum(-1).mean(-1)
+    best = squared.detach().argmin(dim=1)
+    fit = squared.gather(1, best[:, None])[:, 0].mean()
+    loss = 10.0 * fit
+    if waypoints.shape[1] > 1:
+        loss = loss + 10.0 * _OTHER_HYPOTHESES * squared.mean() + 0.1 * functional.nll_loss(scores, best)
+    if clearance_weight > 0:
+        lack = (margin - clearance_at(clearance, waypoints)).clamp(min=0.0) / margin
+        loss = loss + clearance_weight * lack.square().mean()
+    return loss
+
+
+def clearance_at(clearance: torch.Tensor, waypoints: torch.Tensor) -> torch.Tensor:
+    """Clearance [m] at waypoints (B, H, K, 2) of the GOSELO frame from local crops (B, 64, 64) uint8: (B, H, K)."""
+    grid = waypoints * waypoints.new_tensor([2.0, -2.0]) / goselo.LOCAL_SIDE
+    field = clearance[:, None].float() * (goselo.CLEARANCE_CLIP / 255.0)
+    return functional.grid_sample(field, grid, align_corners=False, padding_mode="border")[:, 0]
+
+
+def torch_planner(network: nn.Module, radius: float) -> GoseloPlanner:
+    """A trained network as a planner."""
+    return GoseloPlanner(TorchNetwork(network), tuple(network.channels), radius)  # type: ignore[arg-type]
+
+
+def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisNetwork:
+    """The network of a planner checkpoint."""
+    planner = config.planner
+    network = make_network(planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses)
+    network.load_state_dict(state["network"])
+    return network.eval()
+
+
+def _tensors(samples: Samples, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
+    return tuple(
+        torch.from_numpy(values[rows]) for values in (samples.image, samples.clearance, samples.distance, samples.label)
+    )
+
+
+def _mirror(batch: tuple[torch.Tensor, ...], which: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Reflect some rows left to right."""
+    image, clearance, distance, label = batch
+    image = torch.where(which[:, None, None, None], image.flip(-1), image)
+    clearance = torch.where(which[:, None, None], clearance.flip(-1), clearance)
+    label = torch.where(which[:, None, None], label * label.new_tensor([-1.0, 1.0]), label)
+    return image, clearance, distance, label

@@ -1,0 +1,1 @@
+"""The low-level skill: environment, soft actor-critic, training (torchrl)."""

@@ -1,0 +1,292 @@
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
+from small_bundle import (
+    LAYOUT,
+    ROBOT,
+    ROBOT_SHA,
+    manifest,
+    model_bytes,
+    planner_bytes,
+    skill_bytes,
+    value,
+    write_bundle,
+)
+
+from hiernav.nav import bundle as b
+from hiernav.nav.observation import ObservationLayout, ObservationTerm
+from hiernav.nav.onnx_file import OnnxFileError, inspect_onnx
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_bundle(tmp_path)
+    return tmp_path
+
+
+def edit_manifest(folder: Path, **changes: object) -> None:
+    path = folder / b.MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def replace_file(folder: Path, name: str, data: bytes) -> None:
+    """Exchange a file and have the manifest's hash follow, as somebody with intent would."""
+    (folder / name).write_bytes(data)
+    files = json.loads((folder / b.MANIFEST).read_text())["files"]
+    edit_manifest(folder, files=files | {name: b.file_sha256(folder / name)})
+
+
+def test_what_was_written_is_what_is_loaded(folder):
+    loaded = b.load_bundle(folder)
+    assert loaded.skill == (folder / b.SKILL).read_bytes()
+    assert loaded.planner == (folder / b.PLANNER).read_bytes()
+    assert loaded.manifest.opset == 18
+    assert loaded.manifest.provenance["rate"] == 3e-4
+    assert loaded.layout == LAYOUT
+    assert set(loaded.golden) == set(b.GOLDEN_NAMES)
+
+
+@pytest.mark.parametrize("name", [*b.HASHED_FILES, b.MANIFEST])
+def test_a_missing_file_is_named(folder, name):
+    (folder / name).unlink()
+    with pytest.raises(b.BundleError, match=f"{name}: missing"):
+        b.load_bundle(folder)
+
+
+shares = st.floats(0, 1, exclude_max=True)
+
+
+@settings(max_examples=30)
+@given(name=st.sampled_from(b.HASHED_FILES), at=shares, flip=st.integers(1, 255))
+def test_one_changed_byte_is_noticed_wherever_it_is(tmp_path_factory, name, at, flip):
+    folder = tmp_path_factory.mktemp("bundle")
+    write_bundle(folder)
+    data = bytearray((folder / name).read_bytes())
+    data[int(at * len(data))] ^= flip
+    (folder / name).write_bytes(data)
+    with pytest.raises(b.BundleError, match=f"{name}: SHA-256"):
+        b.load_bundle(folder)
+
+
+@pytest.mark.parametrize("name", b.HASHED_FILES)
+def test_a_truncated_file_is_noticed(folder, name):
+    path = folder / name
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(b.BundleError, match=f"{name}: SHA-256"):
+        b.load_bundle(folder)
+
+
+def test_no_folder_no_bundle(tmp_path):
+    with pytest.raises(b.BundleError, match="no such folder"):
+        b.load_bundle(tmp_path / "nothing")
+
+
+def test_a_newer_format_asks_for_an_upgrade_even_with_fields_unknown_here(folder):
+    edit_manifest(folder, format_version=2, novelty={"x": 1})
+    with pytest.raises(b.BundleError, match="made by a newer hiernav.*upgrade"):
+        b.load_bundle(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format_version": 0}, "format_version 0"),
+        ({"surprise": 1}, "surprise"),
+        ({"control_period_s": 0.0}, "control_period_s"),
+        ({"control_period_s": "fast"}, "control_period_s"),
+        ({"robot_sha256": "xyz"}, "robot_sha256"),
+        ({"provenance": {"nested": {}}}, "provenance"),
+    ],
+)
+def test_a_malformed_manifest_is_refused_by_field(folder, changes, message):
+    edit_manifest(folder, **changes)
+    with pytest.raises(b.BundleError, match=message):
+        b.load_bundle(folder)
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe", b'{"format_version": 1}'])
+def test_a_manifest_that_is_none_is_refused(folder, data):
+    (folder / b.MANIFEST).write_bytes(data)
+    with pytest.raises(b.BundleError, match=b.MANIFEST):
+        b.load_bundle(folder)
+
+
+@pytest.mark.parametrize("name", ["../skill.onnx", "/etc/passwd", "skill.onnx/../x", "extra.onnx", "manifest.json"])
+def test_only_the_known_file_names_are_accepted(folder, name):
+    files = json.loads((folder / b.MANIFEST).read_text())["files"]
+    edit_manifest(folder, files=files | {name: "0" * 64})
+    with pytest.raises(b.BundleError, match="files lists"):
+        b.load_bundle(folder)
+
+
+def test_the_wrong_robot_is_named(folder):
+    bundle = b.load_bundle(folder)
+    bundle.require_robot(ROBOT, ROBOT_SHA)
+    with pytest.raises(b.BundleError, match="for 'point', this is 'car'"):
+        bundle.require_robot("car", ROBOT_SHA)
+    with pytest.raises(b.BundleError, match="robot_sha256"):
+        bundle.require_robot(ROBOT, "b" * 64)
+
+
+GYRO, LIDAR = LAYOUT.terms
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ((LIDAR, GYRO), r"observation\[0\] 'gyro': name is 'gyro' in the bundle, 'lidar' on this robot"),
+        ((GYRO, replace(LIDAR, size=3)), r"observation\[1\] 'lidar': size is 2 in the bundle, 3 on this robot"),
+        ((replace(GYRO, unit="deg/s"), LIDAR), r"observation\[0\] 'gyro': unit is 'rad/s'"),
+        ((GYRO, replace(LIDAR, scale=2.0)), r"observation\[1\] 'lidar': scale is 1.0"),
+        ((GYRO,), r"observation\[1\] 'lidar': it exists only in the bundle"),
+        ((GYRO, LIDAR, ObservationTerm("sonar", 1, "m", 1.0)), r"observation\[2\] 'sonar': .* only on this robot"),
+    ],
+)
+def test_the_first_differing_field_of_the_observation_is_named(folder, terms, message):
+    bundle = b.load_bundle(folder)
+    bundle.require_layout(LAYOUT)
+    with pytest.raises(b.BundleError, match=message):
+        bundle.require_layout(ObservationLayout(terms))
+
+
+def with_external_weights() -> bytes:
+    model = onnx.load_from_string(skill_bytes())
+    weight = model.graph.initializer[0]
+    weight.ClearField("raw_data")
+    weight.data_location = TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value="../../secret.bin")
+    return model.SerializeToString()
+
+
+def test_weights_in_another_file_are_refused(folder):
+    replace_file(folder, b.SKILL, with_external_weights())
+    with pytest.raises(b.BundleError, match="skill.onnx: weights in external files"):
+        b.load_bundle(folder)
+
+
+def test_external_weights_are_found_inside_of_branches():
+    inner = onnx.load_from_string(with_external_weights()).graph
+    inner.ClearField("input")
+    branch = helper.make_node("If", ["c"], ["y"], then_branch=inner, else_branch=inner)
+    data = model_bytes([branch], [value("c", [1], TensorProto.BOOL)], [value("y", ["N", 2])], [])
+    assert inspect_onnx(data).external_data
+
+
+@pytest.mark.parametrize("domain", ["com.microsoft", "evil", "ai.onnx.ml"])
+def test_operators_outside_of_the_standard_are_refused(folder, domain):
+    replace_file(folder, b.SKILL, skill_bytes(domain=domain))
+    with pytest.raises(b.BundleError, match=f"custom operators are not accepted: {domain}.Tanh"):
+        b.load_bundle(folder)
+
+
+def test_a_model_over_50_megabytes_is_refused_before_it_is_read_whole(folder):
+    with (folder / b.SKILL).open("r+b") as file:
+        file.truncate(b.MAX_FILE_BYTES + 1)
+    with pytest.raises(b.BundleError, match="skill.onnx: larger than 50 MB"):
+        b.load_bundle(folder)
+
+
+def test_a_model_of_another_opset_than_promised_is_refused(folder):
+    replace_file(folder, b.SKILL, skill_bytes(opset=17))
+    with pytest.raises(b.BundleError, match="skill.onnx: opset 17, the manifest says 18"):
+        b.load_bundle(folder)
+
+
+def test_something_that_is_no_model_is_refused(folder):
+    replace_file(folder, b.PLANNER, b"MZ this is a program")
+    with pytest.raises(b.BundleError, match="planner.onnx: not an ONNX model"):
+        b.load_bundle(folder)
+
+
+def test_pickled_golden_arrays_are_refused_and_not_executed(folder, tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "exploded",))
+
+    buffer = io.BytesIO()
+    arrays = dict(b.load_bundle(folder).golden) | {"action": np.array([Bomb()], dtype=object)}
+    np.savez(buffer, **arrays)
+    replace_file(folder, b.GOLDEN, buffer.getvalue())
+    with pytest.raises(b.BundleError, match="golden.npz"):
+        b.load_bundle(folder)
+    replace_file(folder, b.GOLDEN, pickle.dumps(Bomb()))
+    with pytest.raises(b.BundleError, match="golden.npz"):
+        b.load_bundle(folder)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_a_golden_file_that_inflates_without_end_is_refused(folder):
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, observation=np.zeros(b.MAX_FILE_BYTES, np.uint8))
+    replace_file(folder, b.GOLDEN, buffer.getvalue())
+    with pytest.raises(b.BundleError, match="golden.npz: inflates"):
+        b.load_bundle(folder)
+
+
+def test_a_golden_file_without_all_its_arrays_is_refused(folder):
+    buffer = io.BytesIO()
+    np.savez(buffer, observation=np.zeros(3))
+    replace_file(folder, b.GOLDEN, buffer.getvalue())
+    with pytest.raises(b.BundleError, match="it must hold"):
+        b.load_bundle(folder)
+    with pytest.raises(ValueError, match="golden arrays are"):
+        b.write_golden(folder, {"observation": np.zeros(3)})
+
+
+def test_a_folder_that_could_not_be_loaded_gets_no_manifest(tmp_path):
+    write_bundle(tmp_path)
+    (tmp_path / b.MANIFEST).unlink()
+    (tmp_path / b.SKILL).write_bytes(with_external_weights())
+    with pytest.raises(b.BundleError, match="external"):
+        b.write_manifest(tmp_path, manifest())
+    (tmp_path / b.SKILL).write_bytes(skill_bytes(opset=17))
+    with pytest.raises(b.BundleError, match="opset"):
+        b.write_manifest(tmp_path, manifest())
+    assert not (tmp_path / b.MANIFEST).exists()
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_are_never_taken_for_a_model(data):
+    with pytest.raises(OnnxFileError):
+        inspect_onnx(data)
+
+
+@given(
+    cut=st.floats(0, 1, exclude_max=True),
+    flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(1, 255))),
+)
+def test_a_damaged_model_is_read_or_refused_but_never_breaks_the_reader(cut, flips):
+    data = bytearray(planner_bytes())
+    for at, flip in flips:
+        data[int(at * len(data))] ^= flip
+    try:
+        facts = inspect_onnx(bytes(data[: len(data) - int(cut * len(data))]))
+    except OnnxFileError:
+        return
+    assert facts.nodes >= 0
+
+
+def test_a_model_nested_without_end_is_refused():
+    data = b""
+    for _ in range(200):
+        data = _field(6, _field(1, _field(5, data)))
+    with pytest.raises(OnnxFileError, match="nested deeper"):
+        inspect_onnx(_field(7, _field(1, _field(5, data))))
+
+
+def _field(number: int, payload: bytes) -> bytes:
+    length, size = b"", len(payload)
+    while size >= 0x80:
+        length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
+    return bytes([number << 3 | 2]) + length + bytes([size]) + payload
