@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -42,7 +42,7 @@ class _Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 
 
-class TensorSpec(_Struct):
+class TensorSpec(_Struct, frozen=True):
     """An input or output of a network."""
 
     name: str
@@ -51,14 +51,14 @@ class TensorSpec(_Struct):
     dtype: str
 
 
-class SkillSpec(_Struct):
+class SkillSpec(_Struct, frozen=True):
     """The skill network: observations to actions."""
 
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
 
 
-class PlannerSpec(_Struct):
+class PlannerSpec(_Struct, frozen=True):
     """The planner network: GOSELO images and distances to waypoints and scores."""
 
     inputs: tuple[TensorSpec, ...]
@@ -67,7 +67,7 @@ class PlannerSpec(_Struct):
     channels: Count
 
 
-class ObservationField(_Struct):
+class ObservationField(_Struct, frozen=True):
     """One term of the observation, as `ObservationTerm`."""
 
     name: str
@@ -76,7 +76,7 @@ class ObservationField(_Struct):
     scale: float
 
 
-class GoseloSpec(_Struct):
+class GoseloSpec(_Struct, frozen=True):
     """How the planner's images are made."""
 
     pixels: Count
@@ -84,7 +84,7 @@ class GoseloSpec(_Struct):
     local_side_m: Positive
 
 
-class PlanSpec(_Struct):
+class PlanSpec(_Struct, frozen=True):
     """What a plan looks like."""
 
     waypoints: Count
@@ -95,7 +95,7 @@ class PlanSpec(_Struct):
     """Further clearance worth a detour when a plan is repaired."""
 
 
-class ReplanSpec(_Struct):
+class ReplanSpec(_Struct, frozen=True):
     """Thresholds of the rule that ends an option."""
 
     d_update_m: Positive
@@ -103,7 +103,7 @@ class ReplanSpec(_Struct):
     invalid: bool
 
 
-class GuardSpec(_Struct):
+class GuardSpec(_Struct, frozen=True):
     """What the guard must do so that the skill drives as it was trained."""
 
     slew_limit: Positive | None = None
@@ -180,7 +180,8 @@ def write_golden(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write `golden.npz`; ValueError unless `arrays` has exactly the `GOLDEN_NAMES`."""
     if set(arrays) != set(GOLDEN_NAMES):
         raise ValueError(f"golden arrays are {', '.join(sorted(arrays))}; they must be {', '.join(GOLDEN_NAMES)}")
-    np.savez_compressed(folder / GOLDEN, **{name: np.asarray(array) for name, array in arrays.items()})
+    plain: dict[str, Any] = {name: np.asarray(array) for name, array in arrays.items()}
+    np.savez_compressed(folder / GOLDEN, **plain)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Manifest:

@@ -14,7 +14,7 @@ import numpy as np
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import Clock
-from hiernav.runtime.estimator import Estimate, Estimator
+from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit
 from hiernav.runtime.robot import Robot, SensorFrame
@@ -178,6 +178,7 @@ class Driver:
         self.agent.reset()
         self.guard.reset()
         self.estimator.reset()
+        _warm_up(self.estimator.config)
         guard_before, estimator_before = self.guard.counts.copy(), self.estimator.counts.copy()
 
         if self.loop.run() is LoopExit.INTERRUPTED:
@@ -307,6 +308,14 @@ class Driver:
             log.exception("the stop could not be verified")
             return False
         return slow >= 3
+
+
+def _warm_up(config: EstimatorConfig) -> None:
+    """Have the linear algebra make its buffers now: with locked memory the first call takes up to 0.2 s."""
+    scratch = Estimator(config)
+    for stamp in (0.0, 0.01):
+        field, still = np.array(config.magnetic_field), np.zeros(3)
+        scratch.update(SensorFrame(stamp, still, still, field, still, position_fix=np.zeros(2)))
 
 
 class TermHold:

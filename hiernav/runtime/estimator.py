@@ -145,7 +145,7 @@ class Estimator:
             self._predict(frame, field)
             forward, left = level_axes(self._tilt.up)
             self._correct_yaw(field, forward, left)
-            self._correct_velocity(_vector(frame.velocimeter, 3), forward, left)
+            self._correct_velocity(_vector(frame.velocimeter), forward, left)
             self._remember()
             self._correct_position(frame)
         return self._estimate() if self.ready else None
@@ -173,7 +173,7 @@ class Estimator:
         if config.tilts:
             if dt > 0.0:
                 self._tilt.predict(dt, mean, change)
-            self._tilt.correct(field, _vector(frame.accelerometer, 3), self._gate_1)
+            self._tilt.correct(field, _vector(frame.accelerometer), self._gate_1)
         _, uy, uz = self._tilt.up
         # Of the body rates, what turns the heading: Euler's kinematic equation for yaw, in terms of `up`.
         level = max(uy * uy + uz * uz, 1e-2)
@@ -186,7 +186,7 @@ class Estimator:
 
     def _measured_rate(self, gyro: np.ndarray | None) -> tuple[Vector, float]:
         """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
-        rate = _vector(gyro, 3)
+        rate = _vector(gyro)
         if rate is None or max(map(abs, rate)) > MAX_RATE:
             return self._rate, 1.0
         jump = math.dist(rate, self._rate)
@@ -199,7 +199,7 @@ class Estimator:
 
     def _trusted_field(self, magnetometer: np.ndarray | None) -> Vector | None:
         """The magnetometer's reading, if it is as strong as the world's field."""
-        field = _vector(magnetometer, 3)
+        field = _vector(magnetometer)
         if field is None:
             return None
         excess = abs(math.sqrt(dot(field, field)) - self._field)
@@ -247,7 +247,7 @@ class Estimator:
             self._history.popleft()
 
     def _correct_position(self, frame: SensorFrame) -> None:
-        fix = _vector(frame.position_fix, 2)
+        fix = _components(frame.position_fix, 2)
         if fix is None:
             if frame.position_fix is not None:
                 self.counts["fix_not_finite"] += 1
@@ -324,7 +324,12 @@ class Estimator:
         )
 
 
-def _vector(value: np.ndarray | None, size: int) -> tuple[float, ...] | None:
+def _vector(value: np.ndarray | None) -> Vector | None:
+    components = _components(value, 3)
+    return None if components is None else (components[0], components[1], components[2])
+
+
+def _components(value: np.ndarray | None, size: int) -> list[float] | None:
     """The components of a measurement as floats; None if it is missing, misshapen, not finite or absurd."""
     if value is None:
         return None
@@ -334,7 +339,7 @@ def _vector(value: np.ndarray | None, size: int) -> tuple[float, ...] | None:
     for component in values:
         if not -ABSURD < component < ABSURD:
             return None
-    return tuple(values)
+    return values
 
 
 def _mean(a: Vector, b: Vector) -> Vector:

@@ -27,6 +27,7 @@ class PlanarFilter(ExtendedKalmanFilter):
         """
         super().__init__(dim_x=6, dim_z=2)
         self.x = np.zeros(6)
+        self.P: np.ndarray = np.eye(6)
         self.Q = np.zeros((6, 6))
         self._velocity_density = velocity_walk**2
         self._bias_density = bias_walk**2
