@@ -19,6 +19,7 @@ from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit
 from hiernav.runtime.robot import Robot, SensorFrame
 from hiernav.runtime.supervisor import Mode, Supervisor
+from hiernav.runtime.terms import TermHold
 from hiernav.runtime.timing import TickTimer
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
@@ -151,7 +152,7 @@ class Driver:
         self.timer = timer or TickTimer(SECTIONS)
         self.supervisor = Supervisor()
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
-        self._observers = list(observers)
+        self.observers = list(observers)
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -279,12 +280,12 @@ class Driver:
 
     def _finish_tick(self, tick: Tick) -> None:
         self.timer.end()
-        for observer in self._observers[:]:
+        for observer in self.observers[:]:
             try:
                 observer(tick)
             except Exception:
                 log.exception("observer failed and is dropped")
-                self._observers.remove(observer)
+                self.observers.remove(observer)
 
     def _stop(self) -> bool:
         """Brake until the measured speed shows that the robot stands; False if it could not be shown in time."""
@@ -316,25 +317,3 @@ def _warm_up(config: EstimatorConfig) -> None:
     for stamp in (0.0, 0.01):
         field, still = np.array(config.magnetic_field), np.zeros(3)
         scratch.update(SensorFrame(stamp, still, still, field, still, position_fix=np.zeros(2)))
-
-
-class TermHold:
-    """Observation terms without holes: what a sensor does not give, or gives as NaN, keeps its last good value."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, np.ndarray] = {}
-        self.held = 0
-        """How often a value was held."""
-
-    def fill(self, frame: SensorFrame) -> dict[str, np.ndarray]:
-        """Terms by name, (1, d) each. A sensor that never gave a good value reads zero, one never seen is absent."""
-        present = frame.terms()
-        for name, value in present.items():
-            value = np.asarray(value, dtype=np.float64).reshape(1, -1)
-            good = np.isfinite(value)
-            if not good.all():
-                self.held += 1
-                value = np.where(good, value, self._last.get(name, np.zeros_like(value)))
-            self._last[name] = value
-        self.held += sum(name not in present for name in self._last)
-        return dict(self._last)

@@ -4,89 +4,21 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
+from hiernav.runtime.estimate import Estimate, EstimatorConfig
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, wrap
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
+
+__all__ = ["Estimate", "Estimator", "EstimatorConfig"]
 
 ABSURD = 1e6
 """No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
-
-
-@dataclass(frozen=True)
-class EstimatorConfig:
-    """Noise of the sensors (standard deviations per component) and limits of trust."""
-
-    gyro_sigma: float = 0.02
-    """[rad/s]"""
-    velocimeter_sigma: float = 0.02
-    """[m/s]"""
-    magnetometer_sigma: float = 0.01
-    """In units of the magnetic field."""
-    fix_sigma: float = 0.02
-    """[m]"""
-    magnetic_field: tuple[float, float, float] = (0.0, -0.5, 0.0)
-    """In the world frame; MuJoCo's default."""
-    tilts: bool = True
-    """Whether the body can roll and pitch. False for a robot that is flat by construction: up is then known."""
-    velocity_walk: float = 0.7
-    """How fast the velocity wanders between readings [m/s per sqrt(s)]."""
-    yaw_walk: float = 0.03
-    """Error of the integrated gyro, besides its noise and its change within a tick [rad per sqrt(s)]."""
-    bias_walk: float = 0.002
-    """How fast the gyro's bias wanders [rad/s per sqrt(s)]."""
-    bias_sigma: float = 0.05
-    """Gyro bias to be expected at the start [rad/s]."""
-    gate_probability: float = 0.9995
-    """Share of good measurements that pass the chi-square gate."""
-    reinit_after: int = 10
-    """Fixes (or headings) rejected in a row after which that part of the state starts again."""
-    resync_after: int = 3
-    """Velocities or turning rates rejected in a row after which they are believed."""
-    reinit_spread: float = 0.3
-    """The last two rejected measurements must agree to this to be believed [m, m/s, rad; rad/s: `max_jump`]."""
-    max_gap: float = 1.0
-    """Without a frame for this long, nothing of the state is worth keeping [s]."""
-    history: float = 0.5
-    """Oldest fix that can still be used [s]."""
-    max_jump: float = 6.0
-    """A gyro reading that differs more than this from the last is taken for a spike [rad/s]."""
-
-    def __post_init__(self) -> None:
-        for name, value in self.__dict__.items():
-            if isinstance(value, float) and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"EstimatorConfig.{name} = {value} must be finite and positive")
-        if not self.gate_probability < 1.0:
-            raise ValueError(f"EstimatorConfig.gate_probability = {self.gate_probability} must be below 1")
-        for name in ("reinit_after", "resync_after"):
-            if getattr(self, name) < 2:
-                raise ValueError(f"EstimatorConfig.{name} = {getattr(self, name)} must be at least 2")
-        if not math.hypot(*self.magnetic_field[:2]) > 0.0:
-            raise ValueError(f"EstimatorConfig.magnetic_field = {self.magnetic_field} must have a horizontal part")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """State at `stamp`."""
-
-    stamp: float
-    """On the robot's clock [s]."""
-    pose: np.ndarray
-    """(3,) x, y, yaw; world frame [m, m, rad]."""
-    velocity: np.ndarray
-    """(2,) world frame [m/s]."""
-    covariance: np.ndarray
-    """(6, 6) of x, y, yaw, forward and left velocity (heading frame), gyro bias."""
-    upright: float
-    """z component of the body's z axis: 1 upright, 0 on its side, -1 on its back."""
-    yaw_rate: float
-    """Turning rate of the heading without the gyro's bias [rad/s]."""
 
 
 class Estimator:

@@ -13,13 +13,14 @@ from rich.console import Console
 from hiernav.nav.occupancy import OccupancyMap, empty_map
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import FakeClock
-from hiernav.runtime.driver import Driver, DriverConfig, TermHold, Tick
+from hiernav.runtime.driver import Driver, DriverConfig, Tick
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import Episode, print_summary, summarise
 from hiernav.runtime.supervisor import InvalidTransition, Mode
+from hiernav.runtime.terms import TermHold
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import parse_world, sample_layout
 
