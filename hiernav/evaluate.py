@@ -10,16 +10,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hiernav.config import OptionConfig, PlannerConfig, TrainConfig
-from hiernav.nav.bundle import load_bundle
+from hiernav.nav.bundle import file_sha256, load_bundle
+from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
-from hiernav.runtime.policy import OnnxPlannerNetwork, OnnxSkill
+from hiernav.runtime.policy import load_policies
 from hiernav.sim.factory import expert_planner, make_task
 from hiernav.sim.layout import WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
@@ -101,9 +103,8 @@ def evaluate(
         layouts = [sample_layout(world, int(s), radius) for s in episode_seeds(seed, count)]
         task = make_task(policies.config, min(rows, count), plan, [world])
         began = time.perf_counter()
-        done = run_episodes(
-            task, policies.skill, layouts, None if on_episode is None else lambda k, e, n=name: on_episode(n, k, e)
-        )
+        report = None if on_episode is None else partial(on_episode, name)
+        done = run_episodes(task, policies.skill, layouts, report)
         if protocol == "paper" and world.kind == "gremlin":
             for episode in done:
                 episode.collisions = 0
@@ -164,9 +165,12 @@ def _plan_counts(planner: Planner) -> dict[str, int]:
 
 def _from_bundle(path: Path) -> Policies:
     bundle = load_bundle(path)
+    robot = get_robot(bundle.manifest.robot)
+    bundle.require_robot(robot.name, file_sha256(robot.xml_path))
+    bundle.require_layout(observation_layout(robot.name))
     manifest = bundle.manifest
     config = TrainConfig(
-        robot=manifest.robot,
+        robot=manifest.robot,  # type: ignore[arg-type]  # get_robot has checked it
         planner=PlannerConfig(
             planning_radius_m=manifest.plan.planning_radius_m, soft_margin_m=manifest.plan.soft_margin_m
         ),
@@ -178,8 +182,8 @@ def _from_bundle(path: Path) -> Policies:
             spacing_m=manifest.plan.spacing_m,
         ),
     )
-    network = OnnxPlannerNetwork(bundle.planner)
-    return Policies(config, OnnxSkill(bundle.skill), network, tuple(manifest.goselo.channels))
+    loaded = load_policies(bundle)
+    return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels)
 
 
 def _from_run(path: Path) -> Policies:

@@ -153,7 +153,8 @@ def record_inputs(
     planner.network = recording
     task = make_task(config, 8, planner)
     task.reset()
-    skill, observations = TorchSkill(actor), []
+    skill = TorchSkill(actor)
+    observations: list[np.ndarray] = []
     while sum(map(len, images)) < count or len(observations) * 8 < count:
         observations.append(task.observation)
         step = task.step(skill(task.observation))

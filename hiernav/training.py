@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import torch
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from hiernav.planner import train as planner_train
 from hiernav.run import Run
@@ -46,7 +46,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
 class _PlannerDisplay:
     def __init__(self, progress: Progress) -> None:
         self.progress = progress
-        self._tasks: dict[str, int] = {}
+        self._tasks: dict[str, TaskID] = {}
 
     def __call__(self, now: planner_train.Progress) -> None:
         if now.stage not in self._tasks:
@@ -64,7 +64,7 @@ class _PlannerDisplay:
 class _SkillDisplay:
     def __init__(self, progress: Progress) -> None:
         self.progress = progress
-        self._task: int | None = None
+        self._task: TaskID | None = None
 
     def __call__(self, now: skill_train.Progress) -> None:
         if self._task is None:

@@ -90,9 +90,9 @@ def images(
         ValueError: a channel has another name.
     """
     plan = [channel.rpartition("_")[::2] for channel in channels]
-    for channel, (source, crop) in zip(channels, plan, strict=True):
+    for name, (source, crop) in zip(channels, plan, strict=True):
         if source not in _SOURCES or crop not in _SIDES:
-            raise ValueError(f"GOSELO channel {channel!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
+            raise ValueError(f"GOSELO channel {name!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
     out = np.empty((len(frame.position), len(channels), PIXELS, PIXELS), dtype=np.uint8)
     right = frame.right
     for row in range(len(out)):

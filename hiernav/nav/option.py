@@ -203,7 +203,7 @@ class WaypointOption:
         due = np.flatnonzero((reason != TerminationReason.NONE) & (reason != TerminationReason.GOAL))
         began = time.perf_counter()
         if len(due):
-            self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due])
+            self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
         return OptionStep(reason, self.plan[rows], self.start[rows], time.perf_counter() - began)
 
     def line(self) -> np.ndarray:
@@ -247,7 +247,7 @@ class WaypointOption:
             query = PlanQuery(
                 position=position[known],
                 goal=goal[known],
-                occupancy=[occupancy[k] for k in known],
+                occupancy=[occupancy[k] for k in known.tolist()],
                 visits=[v for v in visits if v is not None],
                 previous=np.where(self.started[rows[known]][:, None, None], self.plan[rows[known]], np.nan),
             )

@@ -123,8 +123,8 @@ class VerifiedPlanner:
                 for position, plan, occupancy in zip(query.position, plans, query.occupancy, strict=True)
             ]
         )
-        bad = np.flatnonzero(~(clearance >= self.radius))
-        if len(bad):
+        bad = np.flatnonzero(~(clearance >= self.radius)).tolist()
+        if bad:
             part = PlanQuery(
                 query.position[bad],
                 query.goal[bad],

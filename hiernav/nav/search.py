@@ -37,7 +37,7 @@ class PathField:
         goal: np.ndarray,
         radius: float,
         soft_margin: float = 0.0,
-        soft_weight: float = 4.0,
+        soft_weight: float = 8.0,
     ) -> None:
         self.occupancy, self.radius = occupancy, radius
         self.soft_margin, self.soft_weight = soft_margin, soft_weight

@@ -105,7 +105,9 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
     layout = sample_layout(spec, seed, settings.radius)
     occupancy = layout.occupancy(0.0)
     field = PathField(occupancy, layout.goal, settings.radius, settings.soft_margin)
-    starts, labels, visits = [], [], []
+    starts: list[np.ndarray] = []
+    labels: list[np.ndarray] = []
+    visits: list[VisitMap] = []
     fresh = VisitMap(occupancy)
     while len(starts) < count:
         start, seen = _random_start(occupancy, rng), fresh

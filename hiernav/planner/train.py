@@ -22,6 +22,8 @@ from hiernav.sim.robots import get_robot
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
 
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+"""image, clearance, distance, label as in `Samples`."""
 _VALIDATION = 2000
 _VALIDATION_SEED = 0xE7A1
 _WALKS = 200
@@ -126,7 +128,7 @@ class PlannerTrainer:
             batch = _tensors(samples, rows)
             if planner.mirror:
                 batch = _mirror(batch, torch.rand(len(rows)) < 0.5)
-            loss = plan_loss(self.network, *batch, self._margin, planner.clearance_weight)
+            loss = plan_loss(self.network, batch, self._margin, planner.clearance_weight)
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -181,10 +183,7 @@ class PlannerTrainer:
 
 def plan_loss(
     network: PaperNetwork | HypothesisNetwork,
-    image: torch.Tensor,
-    clearance: torch.Tensor,
-    distance: torch.Tensor,
-    label: torch.Tensor,
+    batch: Batch,
     margin: float,
     clearance_weight: float,
 ) -> torch.Tensor:
@@ -192,6 +191,7 @@ def plan_loss(
 
     With one hypothesis and `clearance_weight` 0 this is the paper's loss (Eq. 1), times ten.
     """
+    image, clearance, distance, label = batch
     waypoints, scores = network(image, distance)
     squared = (waypoints - label[:, None]).square().sum(-1).mean(-1)
     best = squared.detach().argmin(dim=1)
@@ -212,9 +212,9 @@ def clearance_at(clearance: torch.Tensor, waypoints: torch.Tensor) -> torch.Tens
     return functional.grid_sample(field, grid, align_corners=False, padding_mode="border")[:, 0]
 
 
-def torch_planner(network: nn.Module, radius: float) -> GoseloPlanner:
+def torch_planner(network: PaperNetwork | HypothesisNetwork, radius: float) -> GoseloPlanner:
     """A trained network as a planner."""
-    return GoseloPlanner(TorchNetwork(network), tuple(network.channels), radius)  # type: ignore[arg-type]
+    return GoseloPlanner(TorchNetwork(network), network.channels, radius)
 
 
 def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisNetwork:
@@ -225,13 +225,14 @@ def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisN
     return network.eval()
 
 
-def _tensors(samples: Samples, rows: np.ndarray) -> tuple[torch.Tensor, ...]:
-    return tuple(
+def _tensors(samples: Samples, rows: np.ndarray) -> Batch:
+    image, clearance, distance, label = (
         torch.from_numpy(values[rows]) for values in (samples.image, samples.clearance, samples.distance, samples.label)
     )
+    return image, clearance, distance, label
 
 
-def _mirror(batch: tuple[torch.Tensor, ...], which: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def _mirror(batch: Batch, which: torch.Tensor) -> Batch:
     """Reflect some rows left to right."""
     image, clearance, distance, label = batch
     image = torch.where(which[:, None, None, None], image.flip(-1), image)

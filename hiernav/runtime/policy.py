@@ -1,4 +1,4 @@
-"""The two networks in ONNX Runtime: one thread, no spinning, loaded from verified bytes."""
+"""The two networks in ONNX Runtime (one thread, no spinning, verified bytes), and the agent made of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 import onnxruntime as ort
 
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, TensorSpec
+from hiernav.nav.option import HierarchicalAgent, ReplanRule, WaypointOption
+from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
 
 GOLDEN_TOLERANCE = 1e-5
 _DTYPES: dict[str, np.dtype[Any]] = {"tensor(float)": np.dtype(np.float32), "tensor(uint8)": np.dtype(np.uint8)}
@@ -113,6 +115,33 @@ def load_policies(bundle: Bundle) -> Policies:
             raise BundleError(f"{what}: {ours} in the network, {theirs} in the manifest")
     check_golden(bundle, policies)
     return policies
+
+
+def make_agent(bundle: Bundle, robot_radius: float, goal_radius: float = 0.3) -> HierarchicalAgent:
+    """The agent a bundle describes, for one robot: planner with verification, termination rule, skill.
+
+    Args:
+        bundle: verified policies.
+        robot_radius: disc with which plans are swept against the map [m].
+        goal_radius: distance at which the goal counts as reached [m].
+
+    Raises:
+        BundleError: as `load_policies`.
+    """
+    policies, plan, replan = load_policies(bundle), bundle.manifest.plan, bundle.manifest.replan
+    proposer = GoseloPlanner(policies.planner, bundle.manifest.goselo.channels, plan.planning_radius_m)
+    expert = ShortestPathPlanner(
+        plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
+    )
+    option = WaypointOption(
+        VerifiedPlanner(proposer, expert, robot_radius),
+        num_rows=1,
+        rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid),
+        num_waypoints=plan.waypoints,
+        goal_radius=goal_radius,
+        sweep_radius=robot_radius,
+    )
+    return HierarchicalAgent(option, policies.skill, bundle.layout)
 
 
 def check_golden(bundle: Bundle, policies: Policies | None = None) -> dict[str, float]:

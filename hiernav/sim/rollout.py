@@ -82,7 +82,7 @@ def run_episodes(
         ended = np.flatnonzero((step.terminated | step.truncated) & (current >= 0))
         if not len(ended):
             continue
-        for row in ended:
+        for row in ended.tolist():
             layout = task.layouts[row]
             counts = task.option.counts[row]
             episode = Episode(

@@ -128,7 +128,7 @@ class NavigationTask:
         before, line = self.sim.pose[:, :2].copy(), self.option.line()
         self.sim.step(actions)
         self.steps += 1
-        for row in np.flatnonzero(self._moving):
+        for row in np.flatnonzero(self._moving).tolist():
             now = float(self.sim.time[row])
             self._maps[row] = self.layouts[row].occupancy(now)
             self._set_points(row, self.layouts[row].obstacle_points(now))
