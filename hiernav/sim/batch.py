@@ -61,8 +61,8 @@ class BatchSim:
         self.model = build_model(robot, scene)
         self._pool = ObstaclePool(scene)
         self._joints = JointReader(robot, self.model)
-        self._datas = [mujoco.MjData(self.model) for _ in range(num_envs)]
-        self._views = [(d.ctrl, d.qpos, d.qvel, d.sensordata, d.history) for d in self._datas]
+        self.datas = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        self._views = [(d.ctrl, d.qpos, d.qvel, d.sensordata, d.history) for d in self.datas]
         self._gremlins: dict[int, Layout] = {}
         self._sensor_columns = {
             name: slice(self.model.sensor(name).adr[0], self.model.sensor(name).adr[0] + 3) for name in BASE_SENSORS
@@ -72,7 +72,7 @@ class BatchSim:
         self._workers = ThreadPoolExecutor(len(self._chunks) - 1, "batch-sim") if len(self._chunks) > 1 else None
         self._allocate()
         self.collided = np.zeros(num_envs, bool)
-        for data in self._datas:
+        for data in self.datas:
             mujoco.mj_forward(self.model, data)
         self._gather(range(num_envs))
         self._publish()
@@ -92,7 +92,7 @@ class BatchSim:
         for layout in layouts:
             self._pool.check(layout)
         for row, layout in zip(rows.tolist(), layouts, strict=True):
-            data = self._datas[row]
+            data = self.datas[row]
             mujoco.mj_resetData(self.model, data)
             self.robot.place(data.qpos, layout.start)
             self._pool.arrange(layout, data.mocap_pos, data.mocap_quat)
@@ -120,7 +120,7 @@ class BatchSim:
             raise ValueError(f"step: action of row {row} is not finite: {actions[row].tolist()}")
         self._controls = np.clip(actions, -1.0, 1.0)
         for row, layout in self._gremlins.items():
-            data = self._datas[row]
+            data = self.datas[row]
             self._pool.move_gremlins(layout, data.time, data.mocap_pos)
         self._allocate()
         if self._workers is None:
@@ -144,7 +144,7 @@ class BatchSim:
         for row in rows:
             if finite[row]:
                 self._views[row][0][:] = controls[row]
-                mujoco.mj_step(model, self._datas[row], nstep=substeps)
+                mujoco.mj_step(model, self.datas[row], nstep=substeps)
         self._gather(rows)
 
     def _allocate(self) -> None:
@@ -163,7 +163,7 @@ class BatchSim:
             state[row, nq:] = row_qvel
             readings[row] = row_readings
             history[row] = row_history
-            time[row] = self._datas[row].time
+            time[row] = self.datas[row].time
 
     def _publish(self) -> None:
         robot, nq, state = self.robot, self.model.nq, self._state

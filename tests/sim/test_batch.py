@@ -43,7 +43,7 @@ def ring_of_pillars(radius: float, count: int = 6) -> np.ndarray:
 def contacts_in_each_substep(sim: BatchSim, row: int, action: np.ndarray) -> tuple[list[bool], int]:
     """Step a copy of one row by single physics steps: whether it touched an obstacle in each, and its self contacts."""
     model, data = sim.model, mujoco.MjData(sim.model)
-    mujoco.mj_copyData(data, model, sim._datas[row])
+    mujoco.mj_copyData(data, model, sim.datas[row])
     data.ctrl[:] = np.clip(action, -1, 1)
     obstacle = np.array([model.geom(i).name.startswith(OBSTACLES) for i in range(model.ngeom)])
     floor = model.geom("floor").id
@@ -237,7 +237,7 @@ def test_velocity_is_the_rate_of_the_position_in_the_world_frame(robot):
     for actions in actions_for(sim, 10):
         sim.step(actions)
     data = mujoco.MjData(sim.model)
-    mujoco.mj_copyData(data, sim.model, sim._datas[0])
+    mujoco.mj_copyData(data, sim.model, sim.datas[0])
     before = sim.pose[0, :2]
     mujoco.mj_step(sim.model, data)
     after = robot.pose(data.qpos[None])[0, :2]
@@ -260,14 +260,14 @@ def test_gremlins_circle_with_the_time_of_their_row():
     sim = BatchSim(get_robot("car"), 2, SceneSpec(gremlins=3))
     layout = layout_of(start=(-1.5, -1.5, 0), gremlins=[[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
     sim.reset([0, 1], [layout, layout])
-    assert_allclose(sim._datas[0].mocap_pos[:, :2], layout.gremlin_positions(0.0))
+    assert_allclose(sim.datas[0].mocap_pos[:, :2], layout.gremlin_positions(0.0))
     for step in range(12):
         if step == 7:
             sim.reset([1], [layout])
         begin = sim.time
         sim.step(np.zeros((2, 2)))
         for row in range(2):
-            assert_allclose(sim._datas[row].mocap_pos[:, :2], layout.gremlin_positions(begin[row]))
+            assert_allclose(sim.datas[row].mocap_pos[:, :2], layout.gremlin_positions(begin[row]))
     assert begin[0] != begin[1]
 
 
@@ -289,7 +289,7 @@ def test_action_that_is_not_finite_is_refused_before_anything_moves(value):
     with pytest.raises(ValueError, match="action of row 1 is not finite"):
         sim.step(actions)
     assert_same(published(sim), before)
-    assert sim._datas[0].time == 0.0
+    assert sim.datas[0].time == 0.0
 
 
 def test_actions_of_the_wrong_shape_are_refused():
@@ -305,7 +305,7 @@ def test_diverged_row_is_reported_and_harms_no_other(robot):
     for each in (sim, healthy):
         each.reset(np.arange(3), [layout] * 3)
     actions = actions_for(sim, 10)
-    sim._datas[1].qvel[0] = np.inf
+    sim.datas[1].qvel[0] = np.inf
     for action in actions:
         for each in (sim, healthy):
             each.step(action)
