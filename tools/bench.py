@@ -46,51 +46,49 @@ def main() -> int:
 
 
 def bench_env(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The batched task, observation, reward and expert planning included."""
+    return {robot: _bench_robot(robot, arguments) for robot in ROBOTS}
+
+
+def _bench_robot(robot: str, arguments: argparse.Namespace) -> dict[str, float]:
     """Alternate short stretches of bare physics and of the whole task, so that both see the same machine."""
     import mujoco
 
     from hiernav.config import load_config
     from hiernav.sim.factory import make_task
 
-    results = {}
-    for robot in ROBOTS:
-        config = load_config(None, [f"robot={robot}", f"threads={arguments.threads}"])
-        task = make_task(config, 32)
-        task.reset()
-        rng = np.random.default_rng(0)
-        actions = rng.uniform(-1.0, 1.0, (64, task.num_rows, task.robot.action_dim))
-        sim = task.sim
-        bare = [mujoco.MjData(sim.model) for _ in range(task.num_rows)]
-        counter = 0
+    task = make_task(load_config(None, [f"robot={robot}", f"threads={arguments.threads}"]), 32)
+    task.reset()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (64, task.num_rows, task.robot.action_dim))
+    model, bare = task.sim.model, [mujoco.MjData(task.sim.model) for _ in range(task.num_rows)]
+    turn = 0
 
-        def ours() -> int:
-            nonlocal counter
-            counter += 1
-            step = task.step(actions[counter % 64])
-            ended = np.flatnonzero(step.terminated | step.truncated)
-            if len(ended):
-                task.reset(ended)
-            return task.num_rows
+    def whole_task() -> int:
+        nonlocal turn
+        turn += 1
+        step = task.step(actions[turn % 64])
+        ended = np.flatnonzero(step.terminated | step.truncated)
+        if len(ended):
+            task.reset(ended)
+        return task.num_rows
 
-        def bare_physics() -> int:
-            for row, data in enumerate(bare):
-                data.ctrl[:] = actions[counter % 64, row]
-                mujoco.mj_step(sim.model, data, nstep=task.robot.substeps)
-            return task.num_rows
+    def bare_physics() -> int:
+        for row, data in enumerate(bare):
+            data.ctrl[:] = actions[turn % 64, row]
+            mujoco.mj_step(model, data, nstep=task.robot.substeps)
+        return task.num_rows
 
-        mine, reference = 0.0, 0.0
-        mine_count, reference_count = 0, 0
-        while mine < arguments.seconds:
-            for data, source in zip(bare, sim.datas, strict=True):
-                mujoco.mj_copyData(data, sim.model, source)
-            count, seconds = _timed(ours, 0.1)
-            mine, mine_count = mine + seconds, mine_count + count
-            count, seconds = _timed(bare_physics, 0.1)
-            reference, reference_count = reference + seconds, reference_count + count
-        rate, limit = mine_count / mine, reference_count / reference
-        results[robot] = {"steps_per_s": rate, "bare_steps_per_s": limit, "ratio": rate / limit}
-        print(f"env {robot:6s} {rate:8,.0f} steps/s   bare mj_step {limit:8,.0f}   ratio {rate / limit:.2f}")
-    return results
+    counts, seconds = np.zeros(2), np.zeros(2)
+    while seconds[0] < arguments.seconds:
+        for data, source in zip(bare, task.sim.datas, strict=True):
+            mujoco.mj_copyData(data, model, source)
+        for k, run in enumerate((whole_task, bare_physics)):
+            count, spent = _timed(run, 0.1)
+            counts[k] += count
+            seconds[k] += spent
+    rate, limit = counts / seconds
+    print(f"env {robot:6s} {rate:8,.0f} steps/s   bare mj_step {limit:8,.0f}   ratio {rate / limit:.2f}")
+    return {"steps_per_s": float(rate), "bare_steps_per_s": float(limit), "ratio": float(rate / limit)}
 
 
 def bench_update(arguments: argparse.Namespace) -> dict[str, Any]:
