@@ -237,14 +237,21 @@ def _config(arguments: argparse.Namespace) -> int:
 
 
 def _check_worlds(config: TrainConfig) -> None:
-    """Refuse worlds that cannot be built before anything is written."""
+    """Refuse worlds that cannot be built or solved before anything is written."""
     from hiernav.config import ConfigError
     from hiernav.sim.layout import parse_world
+    from hiernav.sim.robots import get_robot
+    from hiernav.sim.worlds import sample_layout
 
-    for key, texts in (("planner.worlds", config.planner.worlds), ("skill.world", (config.skill.world,))):
+    body = get_robot(config.robot).radius
+    planned = config.planner.planning_radius_m or body
+    for key, texts, radius in (
+        ("planner.worlds", config.planner.worlds, planned),
+        ("skill.world", (config.skill.world,), body),
+    ):
         for text in texts:
             try:
-                parse_world(text)
+                sample_layout(parse_world(text), 0, radius)
             except ValueError as error:
                 raise ConfigError(f"{key} = {text!r}: {error}") from None
 
@@ -286,6 +293,7 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
 
 
 def _write_json(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
     partial.write_text(json.dumps(value, indent=2) + "\n")
     partial.replace(path)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.config import OptionConfig, PlannerConfig, TrainConfig
-from hiernav.nav.bundle import file_sha256, load_bundle
+from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
@@ -49,7 +49,11 @@ def open_policies(path: str | Path) -> Policies:
         ValueError: the folder is neither, or is incomplete (BundleError, RunError).
     """
     path = Path(path)
-    return _from_run(path) if (path / "config.yaml").exists() else _from_bundle(path)
+    if (path / "config.yaml").exists():
+        return _from_run(path)
+    if path.is_dir() and not (path / MANIFEST).exists():
+        raise ValueError(f"{path} is neither a run folder (it has no config.yaml) nor a bundle (no {MANIFEST})")
+    return _from_bundle(path)
 
 
 def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:

@@ -5,7 +5,6 @@ Normalisation and action scaling are inside the graphs: they take raw observatio
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from hiernav import __version__
 from hiernav.config import TrainConfig
 from hiernav.nav import goselo
 from hiernav.nav.bundle import (
+    MANIFEST,
     PLANNER,
     SKILL,
     GoseloSpec,
@@ -65,24 +65,25 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
         out: bundle folder; it is replaced as a whole, and only by a bundle that has been loaded and checked.
 
     Raises:
-        RunError: the run has no trained planner or skill.
+        RunError: the run has no trained planner or skill, or `out` is in use for something else.
     """
-    run = Run.open(run_path)
+    run, out = Run.open(run_path), Path(out)
+    if out.exists() and not (out / MANIFEST).exists() and (out.is_file() or any(out.iterdir())):
+        raise RunError(f"{out} is not a bundle and not empty: choose another folder to export to")
     states = {stage: run.load(stage) for stage in ("planner", "skill")}
     for stage, state in states.items():
         if state is None:
             raise RunError(f"{run.path} has no trained {stage} yet: go on with `hiernav train --resume {run.path}`")
     network = load_network(run.config, states["planner"])  # type: ignore[arg-type]
     actor = load_actor(run.config, states["skill"])  # type: ignore[arg-type]
-    out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".bundle-") as temporary:
         folder = Path(temporary) / "bundle"
         folder.mkdir()
         write_bundle(folder, run.config, network, actor, _provenance(run, states))
         if out.exists():
-            shutil.rmtree(out)
-        shutil.move(folder, out)
+            out.rename(Path(temporary) / "replaced")
+        folder.rename(out)
     return out
 
 

@@ -89,16 +89,17 @@ class Run:
         write_atomically(folder / "checkpoint.pt", buffer.getvalue())
 
     def load(self, stage: str, rewind: bool = False) -> dict[str, Any] | None:
-        """A stage's checkpoint, or None; `rewind` cuts the metrics back to what they were then."""
-        import torch
+        """A stage's checkpoint, or None; `rewind` cuts off metrics that are newer than every stage's checkpoint.
 
-        file = self.path / stage / "checkpoint.pt"
-        if not file.exists():
-            return None
-        state = torch.load(file, weights_only=True)
+        Raises:
+            RunError: the checkpoint cannot be read.
+        """
         if rewind and self._metrics.exists():
-            os.truncate(self._metrics, min(state["metrics_length"], self._metrics.stat().st_size))
-        return state
+            # every stage: the skill's metrics are newer than the planner's checkpoint and must stay
+            known = [_read_checkpoint(file)["metrics_length"] for file in self.path.glob("*/checkpoint.pt")]
+            os.truncate(self._metrics, min(max(known, default=0), self._metrics.stat().st_size))
+        file = self.path / stage / "checkpoint.pt"
+        return _read_checkpoint(file) if file.exists() else None
 
     def summarize(self, values: Mapping[str, Any]) -> None:
         """Merge values into `summary.json`."""
@@ -110,6 +111,17 @@ class Run:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _read_checkpoint(file: Path) -> dict[str, Any]:
+    import torch
+
+    try:
+        return torch.load(file, weights_only=True)
+    except Exception as error:  # a damaged file fails in any of a dozen ways
+        raise RunError(
+            f"{file} cannot be read ({type(error).__name__}): restore it, or remove it and train with --resume"
+        ) from error
 
 
 def write_atomically(path: Path, data: bytes) -> None:
