@@ -115,7 +115,8 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
             path = field.waypoints(start, 80, 0.05)
             if path is None:
                 continue
-            reached = rng.integers(len(path))
+            # not among the copies of the goal that the path is padded with
+            reached = rng.integers(1 + np.count_nonzero((path[:-1] != path[-1]).any(axis=1)))
             start = path[reached] + rng.normal(0.0, _OFF_PATH, 2)
             if not occupancy.clearance_at(start) > _MIN_CLEARANCE:
                 continue

@@ -1,0 +1,221 @@
+"""Claims about planner training: it learns, its reflections are true ones, and an interrupted run loses nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_run
+
+torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
+
+from hiernav.nav import goselo  # noqa: E402
+from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
+from hiernav.planner import train as planner_train  # noqa: E402
+from hiernav.planner.train import PlannerTrainer, clearance_at, load_network, plan_loss  # noqa: E402
+from hiernav.run import Run  # noqa: E402
+from hiernav.sim.layout import parse_world  # noqa: E402
+from hiernav.sim.worlds import sample_layout  # noqa: E402
+
+pytestmark = pytest.mark.train
+
+
+@pytest.fixture(autouse=True)
+def few_walks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planner_train, "_WALKS", 3)
+
+
+def trainer_in(folder: Path, *overrides: str) -> PlannerTrainer:
+    run = Run.create(tiny_run.config(folder, *overrides))
+    return PlannerTrainer(run.config, run)
+
+
+def metrics_of(run: Run) -> list[dict]:
+    return [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize(("preset", "left"), [("default", 0.75), ("paper", 0.2)])
+def test_the_loss_falls_on_a_small_set(tmp_path, preset, left):
+    trainer = trainer_in(
+        tmp_path / "run",
+        f"planner.preset={preset}",
+        "planner.epochs=12",
+        "planner.learning_rate=3e-3",
+        "planner.clearance_weight=0",
+    )
+    trainer.train()
+    metrics = metrics_of(trainer.run)
+    assert [line["step"] for line in metrics] == list(range(1, 13))
+    assert metrics[-1]["loss"] < left * metrics[0]["loss"]
+    if preset == "paper":  # the default's plans point at the goal before it has learnt anything
+        assert metrics[-1]["error"] < 0.5 * metrics[0]["error"]
+    assert set(metrics[-1]) >= {"walk_collisions", "walk_reach_rate", "blocked_waypoints"}
+    assert trainer.finished
+
+
+def test_a_trained_network_is_read_back_from_the_run(tmp_path):
+    trainer = trainer_in(tmp_path / "run", "planner.epochs=1")
+    trainer.train()
+    loaded = load_network(trainer.config, Run.open(tmp_path / "run").load("planner"))
+    trainer.network.eval()
+    image = torch.randint(0, 256, (3, 4, 64, 64), dtype=torch.uint8)
+    with torch.no_grad():
+        for ours, theirs in zip(trainer.network(image, torch.ones(3)), loaded(image, torch.ones(3)), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, monkeypatch):
+    straight = trainer_in(tmp_path / "straight", "planner.epochs=3", "planner.mirror=true")
+    straight.train()
+
+    broken = trainer_in(tmp_path / "broken", "planner.epochs=3", "planner.mirror=true")
+    updates = 0
+
+    def interrupted(*arguments):
+        nonlocal updates
+        updates += 1
+        if updates == 5:  # three per epoch: in the middle of the second
+            raise KeyboardInterrupt
+        return plan_loss(*arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(planner_train, "plan_loss", interrupted)
+        broken.train()
+    broken.run.log("planner", 2, {"loss": 0.0})  # written after the checkpoint, lost with the process
+    torch.manual_seed(99)
+
+    run = Run.open(tmp_path / "broken")
+    resumed = PlannerTrainer(run.config, run)
+    assert resumed.resume() == 1
+    resumed.train()
+    weights, again = straight.network.state_dict(), resumed.network.state_dict()
+    assert weights.keys() == again.keys()
+    assert all(torch.equal(weights[key], again[key]) for key in weights)
+    assert (run.path / "metrics.jsonl").read_bytes() == (straight.run.path / "metrics.jsonl").read_bytes()
+
+
+def test_a_finished_planner_is_not_trained_again(tmp_path, monkeypatch):
+    trainer = trainer_in(tmp_path / "run", "planner.epochs=1")
+    trainer.train()
+    before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    run = Run.open(tmp_path / "run")
+    again = PlannerTrainer(run.config, run)
+    assert again.resume() == 1 and again.finished
+    monkeypatch.setattr(planner_train, "make_samples", None)  # would fail if it were called
+    again.train()
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
+
+
+class Fixed(torch.nn.Module):
+    """Proposes the same plans whatever it sees."""
+
+    def __init__(self, waypoints, scores):
+        super().__init__()
+        self.waypoints, self.scores = waypoints, scores
+
+    def forward(self, image, distance):
+        return self.waypoints, self.scores
+
+
+def batch_of(label: torch.Tensor, clearance: int = 255) -> planner_train.Batch:
+    rows = len(label)
+    crop = torch.full((rows, 64, 64), clearance, dtype=torch.uint8)
+    return torch.zeros((rows, 4, 64, 64), dtype=torch.uint8), crop, torch.ones(rows), label
+
+
+def test_with_one_hypothesis_and_no_penalty_the_loss_is_the_papers():
+    generator = torch.Generator().manual_seed(0)
+    label, plans = (torch.randn((5, 10, 2), generator=generator) for _ in range(2))
+    loss = plan_loss(Fixed(plans[:, None], torch.zeros(5, 1)), batch_of(label, clearance=0), 0.1, 0.0)
+    torch.testing.assert_close(loss, 10.0 * (plans - label).square().sum(-1).mean())
+
+
+def test_the_best_hypothesis_decides_and_its_score_is_what_learns():
+    label = torch.zeros((1, 10, 2))
+    label[..., 1] = 0.1 * torch.arange(1, 11)
+    sideways = label.flip(-1)
+    plans = torch.stack([sideways, label], dim=1)
+    sure_of = {
+        which: float(plan_loss(Fixed(plans, torch.log_softmax(torch.tensor([score]), -1)), batch_of(label), 0.1, 0.0))
+        for which, score in (("best", [0.0, 5.0]), ("other", [5.0, 0.0]))
+    }
+    lone = float(plan_loss(Fixed(plans[:, :1], torch.zeros(1, 1)), batch_of(label), 0.1, 0.0))
+    assert sure_of["best"] < sure_of["other"] < lone
+
+
+def test_waypoints_near_obstacles_cost_and_those_with_room_do_not():
+    plans = torch.zeros((1, 1, 10, 2))
+    network = Fixed(plans, torch.zeros(1, 1))
+
+    def penalty(clearance: int) -> float:
+        batch = batch_of(plans[:, 0], clearance)
+        return float(plan_loss(network, batch, 0.2, 1.0) - plan_loss(network, batch, 0.2, 0.0))
+
+    assert penalty(255) == 0.0
+    assert penalty(0) == pytest.approx(1.0)
+    half = round(0.1 / goselo.CLEARANCE_CLIP * 255)
+    assert penalty(half) == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_clearance_in_the_crop_is_the_clearance_in_the_world(seed):
+    layout = sample_layout(parse_world("pillar(2,2,10)"), seed, 0.1)
+    occupancy, rng = layout.occupancy(0.0), np.random.default_rng(seed)
+    position = rng.uniform(-1.0, 1.0, (6, 2))
+    frame = goselo.GoseloFrame.of(position, np.broadcast_to(layout.goal, (6, 2)))
+    crop = goselo.images([occupancy] * 6, [VisitMap(occupancy)] * 6, frame, ("clearance_local",))[:, 0]
+    waypoints = rng.uniform(-1.0, 1.0, (6, 2, 10, 2))
+    seen = clearance_at(torch.from_numpy(crop), torch.from_numpy(waypoints).float()).numpy()
+    there = np.minimum(occupancy.clearance_at(frame.to_world(waypoints)), goselo.CLEARANCE_CLIP)
+    inside = occupancy.contains(frame.to_world(waypoints))
+    # the crop is a turned copy at the map's resolution, so the field's ridges are cut by up to half a pixel
+    np.testing.assert_allclose(seen[inside], there[inside], atol=0.04)
+    assert np.abs(seen - there)[inside].mean() < 0.006
+    assert seen[~inside].max(initial=0.0) < 0.06
+
+
+def test_a_reflected_sample_is_the_sample_of_the_reflected_world():
+    layout = sample_layout(parse_world("pillar(2,2,10)"), 1, 0.1)
+    flip = np.array([-1.0, 1.0])
+    other = replace(layout, pillars=layout.pillars * flip, goal=layout.goal * flip)
+    position = np.array([[-1.2, -1.3], [0.9, 0.2]])
+    label = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 10, 2))
+
+    def batch(world, where, plan) -> planner_train.Batch:
+        maps: list[OccupancyMap] = [world.occupancy(0.0)] * 2
+        visits = [VisitMap(m) for m in maps]
+        for each, start in zip(visits, where, strict=True):
+            each.add(start + np.linspace([0.0, 0.0], [0.4 * np.sign(world.goal[0]), 0.3], 20))
+        frame = goselo.GoseloFrame.of(where, np.broadcast_to(world.goal, (2, 2)))
+        image = goselo.images(maps, visits, frame, (*goselo.METRIC_CHANNELS, "visits_2"))
+        in_frame = frame.from_world(plan).astype(np.float32)
+        return tuple(map(torch.from_numpy, (image, image[:, 3].copy(), frame.distance.astype(np.float32), in_frame)))
+
+    ours = batch(layout, position, position[:, None] + label)
+    theirs = batch(other, position * flip, position[:, None] * flip + label * flip)
+    turned = planner_train._mirror(ours, torch.tensor([True, True]))
+    for index, name in enumerate(("image", "clearance", "distance", "label")):
+        apart = (turned[index].float() - theirs[index].float()).abs()
+        limit = 8.0 if index < 2 else 1e-5
+        assert (apart > limit).float().mean() < 0.01, name
+        if name != "distance":
+            assert ((ours[index].float() - theirs[index].float()).abs() > limit).float().mean() > 0.05, name
+
+
+def test_reflection_keeps_label_and_clearance_together_and_leaves_other_rows_alone():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (4, 4, 64, 64), dtype=torch.uint8, generator=generator)
+    clearance = torch.randint(0, 256, (4, 64, 64), dtype=torch.uint8, generator=generator)
+    label = torch.rand((4, 10, 2), generator=generator) * 2.0 - 1.0
+    which = torch.tensor([True, False, True, False])
+    batch = (image, clearance, torch.ones(4), label)
+    turned = planner_train._mirror(batch, which)
+    before, after = (clearance_at(b[1], b[3][:, None]) for b in (batch, turned))
+    torch.testing.assert_close(before, after, rtol=0, atol=1e-4)
+    for mine, theirs in zip(batch, turned, strict=True):
+        assert torch.equal(mine[~which], theirs[~which])
+    again = planner_train._mirror(turned, which)
+    assert all(torch.equal(mine, theirs) for mine, theirs in zip(batch, again, strict=True))
