@@ -83,7 +83,7 @@ def test_a_row_gets_the_same_plan_alone_and_among_others(preset):
 
 
 def test_the_default_network_knows_where_an_obstacle_is_and_the_papers_hardly_does():
-    """Moving one pillar 0.4 m to the other side of the way changes the pooled features of the paper's network little."""
+    """Moving a pillar to the other side of the way hardly changes the pooled features of the paper's network."""
     torch.manual_seed(0)
     paper, ours = PaperNetwork().eval(), HypothesisNetwork(hypotheses=1).eval()
 

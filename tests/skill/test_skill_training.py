@@ -1,0 +1,193 @@
+"""Claims about skill training: an interrupted run loses nothing, a diverged one stops, an able one stops early."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_run
+
+torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
+pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
+
+from hiernav.run import Run, RunError  # noqa: E402
+from hiernav.skill import train as skill_train  # noqa: E402
+from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, load_actor  # noqa: E402
+
+pytestmark = pytest.mark.train
+
+
+def trainer_in(folder: Path, *overrides: str) -> SkillTrainer:
+    run = Run.create(tiny_run.config(folder, *overrides))
+    return SkillTrainer(run.config, run)
+
+
+def reopened(folder: Path) -> SkillTrainer:
+    """A trainer in another process that goes on with a run: nothing is left of the first one but its files."""
+    torch.manual_seed(99)
+    run = Run.open(folder)
+    return SkillTrainer(run.config, run)
+
+
+def at_step(steps: int, act: Callable[[], None]) -> Callable[[Progress], None]:
+    """A progress display that acts once, when `steps` are done."""
+    seen: list[int] = []
+
+    def display(now: Progress) -> None:
+        if now.steps >= steps and not seen:
+            seen.append(now.steps)
+            act()
+
+    return display
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def flat(state: dict, prefix: str = "") -> dict[str, torch.Tensor]:
+    found: dict[str, torch.Tensor] = {}
+    for key, value in state.items():
+        if isinstance(value, dict):
+            found |= flat(value, f"{prefix}{key}.")
+        elif isinstance(value, torch.Tensor):
+            found[f"{prefix}{key}"] = value
+    return found
+
+
+def metrics_of(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> SkillTrainer:
+    """A run that nothing has disturbed."""
+    trainer = trainer_in(tmp_path_factory.mktemp("skill") / "straight")
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[SkillTrainer, Path, dict[str, int]]:
+    """The same run, stopped in the middle of its second segment and gone on with; what was on disk in between."""
+    folder = tmp_path_factory.mktemp("skill") / "interrupted"
+    broken = trainer_in(folder)
+    with pytest.raises(KeyboardInterrupt):
+        broken.train(at_step(384, interrupt))
+    found = {str(file.relative_to(folder)): file.stat().st_size for file in folder.rglob("*") if file.is_file()}
+    broken.run.log("skill", 384, {"reach_rate": 1.0})  # as if the process had died between a line and its checkpoint
+    (folder / "skill" / "checkpoint.pt.part").write_bytes(b"half a checkpoint")
+    trainer = reopened(folder)
+    assert trainer.resume() == 256
+    trainer.train()
+    return trainer, folder, found
+
+
+def test_a_run_does_all_its_steps_evaluates_and_logs(straight):
+    assert straight.finished and straight.steps == 768
+    stages = [(line["stage"], line["step"]) for line in metrics_of(straight.run.path)]
+    assert [step for stage, step in stages if stage == "skill"] == [256, 512, 768]
+    assert [step for stage, step in stages if stage == "evaluation"] == [e["step"] for e in straight.evaluations]
+    assert straight.evaluations[-1]["step"] == 768 and len(straight.evaluations) == 2
+    # 512 steps after the 256 random ones, at 0.1 updates a step
+    assert straight.learner.updates == 51
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(straight, interrupted):
+    resumed, folder, _ = interrupted
+    ours, theirs = flat(straight.learner.state_dict()), flat(resumed.learner.state_dict())
+    assert ours.keys() == theirs.keys() and len(ours) > 20
+    assert [key for key in ours if not torch.equal(ours[key], theirs[key])] == []
+    assert resumed.evaluations == straight.evaluations
+    assert (folder / "metrics.jsonl").read_bytes() == (straight.run.path / "metrics.jsonl").read_bytes()
+
+
+def test_the_replay_is_on_disk_while_it_is_needed(straight, interrupted):
+    _, folder, found = interrupted
+    replay = {name: size for name, size in found.items() if name.startswith("skill/replay/")}
+    # 768 transitions and a batch of simulations, two observations of 42 float32 each
+    assert sum(replay.values()) > 776 * 2 * 42 * 4
+    assert not (folder / "skill" / "replay").exists() and not (straight.run.path / "skill" / "replay").exists()
+
+
+def test_the_best_actor_is_what_a_run_leaves(straight):
+    state = Run.open(straight.run.path).load("skill")
+    best = load_actor(straight.config, state)
+    observation = np.random.default_rng(0).standard_normal((5, 42)).astype(np.float32)
+    action = TorchSkill(best)(observation)
+    assert action.shape == (5, 2) and (np.abs(action) <= 1.0).all()
+    assert all(torch.equal(value, straight.best_actor[key]) for key, value in best.state_dict().items())
+
+
+def test_a_skill_that_was_never_evaluated_is_refused_with_a_hint(tmp_path):
+    trainer = trainer_in(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(at_step(384, interrupt))
+    state = trainer.run.load("skill")
+    assert state["steps"] == 256 and state["best_actor"] is None
+    with pytest.raises(RunError, match="train for longer"):
+        load_actor(trainer.config, state)
+
+
+def test_a_loss_that_is_not_finite_stops_training_before_it_reaches_the_checkpoint(tmp_path):
+    trainer = trainer_in(tmp_path / "run")
+
+    def poison() -> None:
+        with torch.no_grad():
+            for name, weight in trainer.learner.loss.named_parameters():
+                if "qvalue" in name:
+                    weight.fill_(torch.nan)
+
+    with pytest.raises(TrainingDiverged, match=r"loss_\w+.* not finite after \d+ updates.*last checkpoint"):
+        trainer.train(at_step(640, poison))
+    again = reopened(tmp_path / "run")
+    assert again.resume() == 512
+    assert all(value.isfinite().all() for value in flat(again.learner.state_dict()["loss"]).values())
+
+
+@pytest.mark.parametrize(("rate", "steps"), [("0.9", 512), ("1.0", 768)])
+def test_a_skill_that_reaches_the_wanted_rate_stops(tmp_path, monkeypatch, rate, steps):
+    """The first evaluation finds a robot that always arrives but once."""
+    drive, evaluated = skill_train.run_episodes, []
+
+    def arriving(*arguments):
+        evaluated.append(0)
+        return [replace(episode, reached=k > 0) for k, episode in enumerate(drive(*arguments))]
+
+    monkeypatch.setattr(skill_train, "run_episodes", arriving)
+    trainer = trainer_in(
+        tmp_path / "run", f"skill.stop_reach_rate={rate}", "skill.eval_episodes=10", "skill.updates_per_step=0.02"
+    )
+    trainer.train()
+    assert trainer.evaluations[0]["reach_rate"] == 0.9
+    assert trainer.steps == steps and trainer.finished
+    assert len(evaluated) == (1 if steps == 512 else 2)
+    again = reopened(tmp_path / "run")
+    assert again.resume() == steps and again.finished
+
+
+def test_the_critics_learn_from_scaled_rewards_and_the_log_shows_unscaled_ones(tmp_path):
+    short = ("skill.total_steps=256", "skill.learning_starts=255", "skill.eval_episodes=1")
+    rewards, logged = {}, {}
+    for scale in (1.0, 8.0):
+        trainer = trainer_in(tmp_path / str(scale), f"skill.reward_scale={scale}", *short)
+
+        def keep(trainer=trainer, scale=scale) -> None:
+            rewards[scale] = trainer.replay._data["next", "reward"][:256].clone()
+
+        trainer.train(at_step(256, keep))
+        logged[scale] = {k: v for k, v in metrics_of(tmp_path / str(scale))[0].items() if k.startswith("reward/")}
+    assert rewards[1.0].abs().max() > 0.0
+    torch.testing.assert_close(rewards[8.0], 8.0 * rewards[1.0], rtol=1e-6, atol=0)
+    assert logged[1.0] == logged[8.0] != {}
+
+
+def test_another_seed_is_another_run(tmp_path, straight):
+    other = trainer_in(tmp_path / "run", "seed=4", "skill.total_steps=256", "skill.learning_starts=128")
+    other.train()
+    first, second = (run.path / "metrics.jsonl" for run in (straight.run, other.run))
+    assert first.read_text().splitlines()[0] != second.read_text().splitlines()[0]

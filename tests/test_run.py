@@ -1,0 +1,163 @@
+"""Claims about run folders: nothing is overwritten, nothing is half written, and what was logged is what is read."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import tiny_run
+
+from hiernav import run as run_module
+from hiernav.config import ConfigError, load_config
+from hiernav.run import Run, RunError, write_atomically
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    made = Run.create(tiny_run.config(tmp_path / "run"))
+    yield made
+    made.close()
+
+
+def lines(run: Run) -> list[dict]:
+    return [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_a_new_run_holds_every_value_of_its_configuration(run):
+    assert load_config(run.path / "config.yaml") == run.config
+    assert Run.open(run.path).config == run.config
+    text = (run.path / "config.yaml").read_text()
+    assert "total_steps: 768" in text and "tau:" in text
+
+
+def test_a_run_without_a_folder_gets_one_named_after_time_robot_and_seed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = Run.create(load_config(None, ["robot=car", "seed=12"]))
+    assert made.path.parent == Path("runs")
+    assert made.path.name.endswith("-car-12")
+    assert Run.open(made.path).config.seed == 12
+
+
+def test_an_existing_run_is_refused_and_stays_as_it_is(run):
+    before = (run.path / "config.yaml").read_bytes()
+    with pytest.raises(RunError, match=r"holds a run already: go on with --resume .*run, or choose another run_dir"):
+        Run.create(tiny_run.config(run.path, "seed=77"))
+    assert (run.path / "config.yaml").read_bytes() == before
+
+
+def test_a_folder_that_is_no_run_is_refused_with_a_hint(tmp_path):
+    for path in (tmp_path, tmp_path / "absent"):
+        with pytest.raises(RunError, match=r"is not a run folder: it has no config\.yaml; `hiernav train` makes one"):
+            Run.open(path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_whose_configuration_is_broken_is_named(run):
+    (run.path / "config.yaml").write_text("skill: {num_envs: 0}\n")
+    with pytest.raises(ConfigError, match=r"run/config\.yaml: skill\.num_envs = 0"):
+        Run.open(run.path)
+
+
+def test_a_file_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
+    file = tmp_path / "checkpoint.pt"
+    write_atomically(file, b"old")
+    synced: list[bytes] = []
+
+    def fail(source, target):
+        synced.append(Path(source).read_bytes())
+        raise OSError("power cut")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="power cut"):
+        patch.setattr(run_module.os, "replace", fail)
+        write_atomically(file, b"new and longer")
+    assert file.read_bytes() == b"old"
+    assert synced == [b"new and longer"]  # complete, on disk, before it takes the old one's place
+    write_atomically(file, b"newest")
+    assert file.read_bytes() == b"newest"
+    assert os.listdir(tmp_path) == ["checkpoint.pt"]
+
+
+def test_summaries_of_the_stages_are_merged(run):
+    run.summarize({"planner": {"error": 0.1}})
+    run.summarize({"skill": {"reach_rate": 0.5}})
+    run.summarize({"planner": {"error": 0.05}})
+    assert json.loads((run.path / "summary.json").read_text()) == {
+        "planner": {"error": 0.05},
+        "skill": {"reach_rate": 0.5},
+    }
+
+
+@pytest.mark.train
+def test_metrics_are_one_json_object_a_line_and_curves(run):
+    run.log("skill", 100, {"reach_rate": 0.5, "updates": 7})
+    run.log("evaluation", 100, {"reach_rate": 0.25})
+    assert lines(run) == [
+        {"stage": "skill", "step": 100, "reach_rate": 0.5, "updates": 7},
+        {"stage": "evaluation", "step": 100, "reach_rate": 0.25},
+    ]
+    run.close()
+    assert [file.name.partition(".tfevents")[0] for file in (run.path / "tensorboard").iterdir()] == ["events.out"]
+
+
+@pytest.mark.train
+def test_a_checkpoint_is_read_as_it_was_written_and_stages_do_not_mix(run):
+    import torch
+
+    assert run.load("skill") is None
+    run.save("skill", {"weights": torch.arange(5.0), "steps": 3, "best": None})
+    state = Run.open(run.path).load("skill")
+    assert torch.equal(state["weights"], torch.arange(5.0))
+    assert state["steps"] == 3 and state["best"] is None
+    assert run.load("planner") is None
+    assert os.listdir(run.path / "skill") == ["checkpoint.pt"]
+
+
+@pytest.mark.train
+def test_going_on_cuts_off_what_was_logged_after_the_checkpoint(run):
+    run.log("planner", 1, {"loss": 1.0})
+    run.save("planner", {"epoch": 1})
+    run.log("planner", 2, {"loss": 0.5})
+    assert run.load("planner")["epoch"] == 1 and len(lines(run)) == 2
+    run.load("planner", rewind=True)
+    assert lines(run) == [{"stage": "planner", "step": 1, "loss": 1.0}]
+
+
+@pytest.mark.train
+def test_going_on_keeps_what_another_stage_has_logged_since(run):
+    run.log("planner", 1, {"loss": 1.0})
+    run.save("planner", {"epoch": 1})
+    run.log("skill", 100, {"reach_rate": 0.1})
+    run.save("skill", {"steps": 100})
+    run.log("skill", 200, {"reach_rate": 0.2})
+    for stage in ("planner", "skill"):  # in the order in which training goes on
+        run.load(stage, rewind=True)
+    assert [line["step"] for line in lines(run)] == [1, 100]
+
+
+@pytest.mark.train
+def test_going_on_without_a_checkpoint_starts_the_metrics_anew(run):
+    run.log("skill", 100, {"reach_rate": 0.1})
+    assert run.load("skill", rewind=True) is None
+    assert lines(run) == []
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("damage", [b"", b"not a checkpoint", None])
+def test_a_damaged_checkpoint_is_named(run, damage):
+    run.save("skill", {"steps": 100})
+    file = run.path / "skill" / "checkpoint.pt"
+    file.write_bytes(file.read_bytes()[:-40] if damage is None else damage)
+    with pytest.raises(RunError, match=r"skill/checkpoint\.pt cannot be read .*--resume"):
+        run.load("skill")
+
+
+@pytest.mark.train
+def test_a_checkpoint_that_would_run_code_is_refused(run):
+    import torch
+
+    run.save("skill", {"steps": 100})
+    torch.save({"steps": Path("/")}, run.path / "skill" / "checkpoint.pt")  # a pickled class of another library
+    with pytest.raises(RunError, match="cannot be read"):
+        run.load("skill")
