@@ -93,10 +93,12 @@ def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, s
 
 
 def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Arc length of the foot of each point on its polyline, negative before the first vertex.
+    """Arc length of the foot of each point on its polyline, less the distance to that foot.
 
-    The first edge is continued backwards without end, so that backing away from a fresh plan costs what coming
-    forward again pays. The value is a function of position alone: over any closed motion its changes sum to zero.
+    It is 0 at the start and negative behind it, so backing away from a fresh plan costs what coming forward again pays.
+    The value is a function of position alone: over any closed motion its changes sum to zero. It is also at most what
+    the way to the goal has become shorter if the line is a shortest path (triangle inequality), so not even a motion
+    that provokes new plans on its way can earn more than it came nearer to the goal.
 
     Args:
         points: (N, 2) [m].
@@ -108,17 +110,11 @@ def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     begin, edge = line[:, :-1], np.diff(line, axis=1)
     squared = np.square(edge).sum(-1)
     t = ((points[:, None, :] - begin) * edge).sum(-1) / np.maximum(squared, _TINY)
-    foot = begin + np.clip(t, 0.0, 1.0)[..., None] * edge
-    nearest = np.square(points[:, None, :] - foot).sum(-1).argmin(-1)
-    rows = np.arange(len(line))
-    arc, length = arc_lengths(line), np.sqrt(squared)
-    along = arc[rows, nearest] + np.clip(t[rows, nearest], 0.0, 1.0) * length[rows, nearest]
-
-    # before the start: signed distance along the first edge that has a direction
-    first = (length > 1e-6).argmax(axis=1)
-    direction = edge[rows, first] / np.maximum(length[rows, first], _TINY)[:, None]
-    behind = ((points - line[:, 0]) * direction).sum(-1)
-    return np.where((along <= 0.0) & (behind < 0.0), behind, along)
+    t = np.clip(t, 0.0, 1.0)
+    apart = np.square(points[:, None, :] - begin - t[..., None] * edge).sum(-1)
+    rows, nearest = np.arange(len(line)), apart.argmin(-1)
+    along = arc_lengths(line)[rows, nearest] + t[rows, nearest] * np.sqrt(squared[rows, nearest])
+    return along - np.sqrt(apart[rows, nearest])
 
 
 def _longest(lengths: np.ndarray) -> float:

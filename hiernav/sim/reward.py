@@ -10,7 +10,7 @@ import numpy as np
 from hiernav.config import RewardConfig
 from hiernav.nav import path
 
-TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "goal_distance")
+TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "fall", "goal_distance")
 
 
 def weighted_sum(config: RewardConfig, terms: dict[str, np.ndarray]) -> np.ndarray:
@@ -27,6 +27,7 @@ def reward_terms(
     collided: np.ndarray,
     reached: np.ndarray,
     left: np.ndarray,
+    fallen: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Unweighted terms of one control step, each (N,) float64.
 
@@ -34,7 +35,7 @@ def reward_terms(
         before, after: (N, 2) position at both ends of the step [m].
         line: (N, K + 1, 2) plan active DURING the step, with the position it was made from in front [m].
         goal: (N, 2) [m].
-        collided, reached, left: (N,) bool.
+        collided, reached, left, fallen: (N,) bool.
     """
     vertices = path.divide(line, config.division_m)
     count = count_progress if config.preset == "paper" else signed_progress
@@ -44,6 +45,7 @@ def reward_terms(
         "collision": collided.astype(np.float64),
         "goal": reached.astype(np.float64),
         "leave_field": left.astype(np.float64),
+        "fall": fallen.astype(np.float64),
         "goal_distance": np.linalg.norm(after - goal, axis=-1),
     }
 
@@ -59,5 +61,5 @@ def count_progress(
 def signed_progress(
     before: np.ndarray, after: np.ndarray, line: np.ndarray, vertices: np.ndarray, spacing: float
 ) -> np.ndarray:
-    """Progress along the plan in units of the spacing, signed before its first vertex: closed motions earn nothing."""
+    """Progress along the plan in units of the spacing, less that away from it: closed motions earn nothing."""
     return (path.signed_progress(after, line) - path.signed_progress(before, line)) / spacing
