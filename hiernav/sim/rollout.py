@@ -63,13 +63,15 @@ def run_episodes(
         skill: observations (N, D) -> actions (N, A).
         on_episode: called with the index of the layout and the episode, in the order in which they end.
     """
+    if not layouts:
+        return []
     results: list[Episode | None] = [None] * len(layouts)
     rows = min(task.num_rows, len(layouts))
     current = np.full(task.num_rows, -1)
     current[:rows] = np.arange(rows)
     waiting = rows
     # rows without an episode of their own repeat one and are not looked at
-    task.reset(layouts=[layouts[row % max(rows, 1)] for row in range(task.num_rows)] if layouts else [])
+    task.reset(layouts=[layouts[row % rows] for row in range(task.num_rows)])
     driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))
     collisions = np.zeros(task.num_rows, dtype=np.int64)
     while (current >= 0).any():

@@ -44,6 +44,8 @@ class TaskStep:
     """(N,) bool: cap on steps reached."""
     collided: np.ndarray
     """(N,) bool: contact with an obstacle during the step."""
+    fallen: np.ndarray
+    """(N,) bool: the episode ends because the robot has turned over."""
     broken: np.ndarray
     """(N,) bool: the physics is no longer finite."""
     option: OptionStep
@@ -51,7 +53,7 @@ class TaskStep:
     @property
     def terminated(self) -> np.ndarray:
         """(N,) bool: the episode has ended for good (goal or field left)."""
-        return self.reached | self.left | self.broken
+        return self.reached | self.left | self.fallen | self.broken
 
 
 class NavigationTask:
@@ -65,6 +67,7 @@ class NavigationTask:
         layout: of the observation.
         reward: weights of its terms.
         threads: that step the physics.
+        end_on_fall: whether an episode ends when the robot has turned over; a training aid, no protocol has it.
     """
 
     def __init__(
@@ -76,11 +79,13 @@ class NavigationTask:
         layout: ObservationLayout,
         reward: RewardConfig | None = None,
         threads: int = 1,
+        end_on_fall: bool = False,
     ) -> None:
         self.robot, self.layout, self.option = robot, layout, option
         self.num_rows = option.num_rows
         self.reward = reward or RewardConfig()
         self.sim = BatchSim(robot, self.num_rows, scene_for(worlds), threads)
+        self.end_on_fall = end_on_fall
         self._draw = layouts
         self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
         self._maps: list[OccupancyMap] = [None] * self.num_rows  # type: ignore[list-item]
@@ -123,8 +128,8 @@ class NavigationTask:
 
     def step(self, actions: np.ndarray) -> TaskStep:
         """One control step of all rows with actions (N, A) in [-1, 1]."""
-        if not self.option.started.any():
-            raise RuntimeError("reset the task before its first step")
+        if any(layout is None for layout in self.layouts):
+            raise RuntimeError("reset every row of the task before its first step")
         before, line = self.sim.pose[:, :2].copy(), self.option.line()
         self.sim.step(actions)
         self.steps += 1
@@ -135,19 +140,22 @@ class NavigationTask:
         after = self.sim.pose[:, :2]
         broken = ~self.sim.finite
         reached = np.linalg.norm(after - self.goal, axis=-1) <= GOAL_RADIUS
-        left = ~np.array([layout.in_field(after[row][None])[0] for row, layout in enumerate(self.layouts)])
+        left = ~np.array([layout.in_field(after[row][None])[0] for row, layout in enumerate(self.layouts)]) & ~broken
         reached &= ~left
         collided = self.sim.collided
-        terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left)
+        fallen = self.sim.upright < 0.0
+        terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left, fallen)
+        terms = {name: np.where(broken, 0.0, values) for name, values in terms.items()}
         option = self._observe(np.arange(self.num_rows))
         return TaskStep(
             observation=self.observation,
             reward=weighted_sum(self.reward, terms),
             terms=terms,
             reached=reached,
-            left=left & ~broken,
-            truncated=(self.steps >= self._max_steps) & ~reached & ~left & ~broken,
+            left=left,
+            truncated=(self.steps >= self._max_steps) & ~(reached | left | broken | (fallen & self.end_on_fall)),
             collided=collided,
+            fallen=fallen & self.end_on_fall,
             broken=broken,
             option=option,
         )
