@@ -30,9 +30,9 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The waypoint generator: its data set, its network and its training (method sections 4 and 5)."""
 
     preset: Annotated[Literal["default", "paper"], Meta(description="`paper`: the published network.")] = "default"
-    samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 100_000
+    samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 40_000
     samples_per_world: Annotated[int, Meta(ge=1, description="Starts labelled by one shortest-path field.")] = 100
-    epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 20
+    epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 10
     batch_size: Annotated[int, Meta(ge=1, description="Samples per update.")] = 256
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimiser.")] = 1e-3
     weight_decay: Annotated[float, Meta(ge=0, le=1, description="Decoupled weight decay of the optimiser.")] = 1e-4
@@ -51,9 +51,6 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     worlds: Annotated[
         tuple[World, ...], Meta(min_length=1, description="Worlds the samples are drawn from, in equal parts.")
     ] = ("pillar(2,2,10)",)
-    minutes: Annotated[
-        Annotated[float, Meta(gt=0)] | None, Meta(description="Time limit of training [min]; null: none.")
-    ] = None
 
 
 class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -67,33 +64,34 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     planner: Annotated[
         Literal["astar", "cnn"], Meta(description="Who plans in training: exact search or the trained network.")
     ] = "astar"
-    num_envs: Annotated[int, Meta(ge=1, le=65_536, description="Simulations stepped together.")] = 16
-    total_steps: Annotated[int, Meta(ge=1, description="Control steps in all, summed over simulations.")] = 1_000_000
+    num_envs: Annotated[int, Meta(ge=1, le=65_536, description="Simulations stepped together.")] = 32
+    total_steps: Annotated[int, Meta(ge=1, description="Control steps in all, summed over simulations.")] = 200_000
     learning_starts: Annotated[int, Meta(ge=0, description="Steps with random actions before the first update.")] = (
-        10_000
+        2_000
     )
-    updates_per_step: Annotated[float, Meta(gt=0, le=64, description="Gradient updates per control step.")] = 1.0
+    updates_per_step: Annotated[float, Meta(gt=0, le=64, description="Gradient updates per control step.")] = 0.5
     batch_size: Annotated[int, Meta(ge=1, description="Transitions per update.")] = 256
     buffer_size: Annotated[int, Meta(ge=1, description="Transitions kept for replay.")] = 1_000_000
     hidden: Annotated[tuple[Width, ...], Meta(min_length=1, description="Widths of the hidden layers.")] = (256, 256)
-    discount: Annotated[float, Meta(ge=0, lt=1, description="Discount per control step.")] = 0.99
+    discount: Annotated[float, Meta(ge=0, lt=1, description="Discount per control step.")] = 0.98
     tau: Annotated[float, Meta(gt=0, le=1, description="Rate at which target critics follow.")] = 0.005
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimisers.")] = 3e-4
     alpha_floor: Annotated[float, Meta(ge=0, description="The temperature does not fall below this.")] = 0.005
-    init_alpha: Annotated[float, Meta(gt=0, description="Temperature at the start.")] = 1.0
+    init_alpha: Annotated[float, Meta(gt=0, description="Temperature at the start.")] = 0.05
     target_entropy: Annotated[
         float | None, Meta(description="Entropy the temperature aims at [nat]; null: -actions.")
     ] = None
     reward_scale: Annotated[float, Meta(gt=0, description="Factor on the reward that the critics learn from.")] = 1.0
-    eval_every_steps: Annotated[int, Meta(ge=1, description="Steps between evaluations.")] = 50_000
-    eval_episodes: Annotated[int, Meta(ge=1, description="Episodes per evaluation.")] = 50
-    checkpoint_every_steps: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 50_000
+    eval_every_steps: Annotated[int, Meta(ge=1, description="Steps between evaluations.")] = 10_000
+    eval_episodes: Annotated[int, Meta(ge=1, description="Episodes per evaluation.")] = 100
+    checkpoint_every_steps: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 5_000
     stop_reach_rate: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
         Meta(description="Stop once an evaluation reaches this rate; null: never."),
     ] = None
+    mirror: Annotated[bool, Meta(description="Reflect half of every batch left to right.")] = True
+    end_on_fall: Annotated[bool, Meta(description="End a training episode when the robot has turned over.")] = True
     layer_norm: Annotated[bool, Meta(description="Layer normalisation in the critics.")] = False
-    compile: Annotated[bool, Meta(description="Compile the update with torch.compile.")] = False
 
 
 class OptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -123,7 +121,8 @@ class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     progress: Annotated[float, Meta(description="Per `division_m` of progress along the plan.")] = 0.5
     collision: Annotated[float, Meta(description="Per control step with any contact with an obstacle.")] = -1.0
     goal: Annotated[float, Meta(description="Once, on reaching the goal.")] = 1.0
-    leave_field: Annotated[float, Meta(description="Once, on leaving the field.")] = 0.0
+    leave_field: Annotated[float, Meta(description="Once, on leaving the field.")] = -3.0
+    fall: Annotated[float, Meta(description="Per control step on its back; see skill.end_on_fall.")] = -3.0
     goal_distance: Annotated[float, Meta(description="Per metre of distance to the goal, every step.")] = 0.0
     division_m: Annotated[
         float, Meta(gt=0, le=1, description="Spacing of the points that plan and motion are divided in [m].")
@@ -145,16 +144,30 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reward: RewardConfig = RewardConfig()
 
 
+_PAPER_SAC: dict[str, Any] = {
+    "num_envs": 1,
+    "total_steps": 3_000_000,
+    "learning_starts": 10_000,
+    "updates_per_step": 1.0,
+    "discount": 0.99,
+    "init_alpha": 1.0,
+    "alpha_floor": 0.0,
+    "mirror": False,
+    "end_on_fall": False,
+}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "planner": {
         "paper": {"weight_decay": 0.0, "hypotheses": 1, "clearance_weight": 0.0, "mirror": False, "soft_margin_m": 0.0},
     },
     "skill": {
-        "paper": {"planner": "cnn", "num_envs": 1, "alpha_floor": 0.0},
-        "baseline": {"num_envs": 1, "alpha_floor": 0.0},
+        "paper": _PAPER_SAC | {"planner": "cnn"},
+        "baseline": _PAPER_SAC,
     },
     "option": {"paper": {"invalid": False}},
-    "reward": {"baseline": {"path_distance": 0.0, "progress": 0.0, "goal_distance": -1.0}},
+    "reward": {
+        "paper": {"leave_field": 0.0, "fall": 0.0},
+        "baseline": {"leave_field": 0.0, "fall": 0.0, "path_distance": 0.0, "progress": 0.0, "goal_distance": -1.0},
+    },
 }
 """Section -> preset -> the values that differ from the field defaults."""
 

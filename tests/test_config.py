@@ -69,7 +69,9 @@ def test_option_and_reward_follow_the_preset_of_the_skill() -> None:
     assert not paper.option.invalid
     assert paper.reward.preset == "paper"
     baseline = load_config(overrides=["skill.preset=baseline"])
-    assert baseline.reward == RewardConfig(preset="baseline", path_distance=0.0, progress=0.0, goal_distance=-1.0)
+    assert baseline.reward == RewardConfig(
+        preset="baseline", path_distance=0.0, progress=0.0, leave_field=0.0, fall=0.0, goal_distance=-1.0
+    )
     assert load_config(overrides=["skill.preset=paper", "reward.preset=default"]).reward == RewardConfig()
 
 
@@ -125,7 +127,7 @@ def test_an_empty_file_or_section_changes_nothing(tmp_path: Path, text: str) -> 
         ("skill: {num_envs: '8'}", ["skill.num_envs", "'8'", "int"]),
         ("skill: {num_envs: 010}", ["skill.num_envs", "'010'", "int"]),
         ("skill: {num_envs: }", ["skill.num_envs", "None", "int"]),
-        ("skill: {compile: on}", ["skill.compile", "'on'", "true | false"]),
+        ("skill: {mirror: on}", ["skill.mirror", "'on'", "true | false"]),
         ("skill: {discount: 1.0}", ["skill.discount", "1.0", "< 1"]),
         ("skill: {hidden: []}", ["skill.hidden", "[]", "at least 1"]),
         ("skill: {hidden: [256, 0]}", ["skill.hidden", "[256, 0]", "int >= 1"]),
@@ -236,7 +238,7 @@ def test_an_override_into_a_section_of_a_wrong_type_blames_the_file(tmp_path: Pa
     ("overrides", "parts"),
     [
         (["skill.buffer_size=100"], ["skill.batch_size = 256", "skill.buffer_size = 100"]),
-        (["skill.total_steps=1000"], ["skill.learning_starts = 10000", "skill.total_steps = 1000"]),
+        (["skill.total_steps=1000"], ["skill.learning_starts = 2000", "skill.total_steps = 1000"]),
         (["skill.preset=baseline", "reward.preset=default"], ["reward.path_distance", "baseline"]),
     ],
 )
@@ -276,7 +278,6 @@ def configs(draw: st.DrawFn) -> TrainConfig:
         planner=PlannerConfig(
             preset=draw(st.sampled_from(["default", "paper"])),
             worlds=tuple(draw(st.lists(st.sampled_from(["pillar(2,2,10)", "gremlin", "map(a b.yaml)"]), min_size=1))),
-            minutes=draw(st.none() | unit),
             mirror=draw(st.booleans()),
         ),
         skill=SkillConfig(

@@ -31,7 +31,6 @@ SETTINGS = [
     "skill.eval_episodes=4",
     "skill.checkpoint_every_steps=256",
     "skill.stop_reach_rate=null",
-    "skill.compile=false",
 ]
 
 

@@ -50,6 +50,7 @@ def make_task(
     planner: Planner | None = None,
     worlds: Sequence[WorldSpec] | None = None,
     layouts: LayoutSource | None = None,
+    end_on_fall: bool = False,
 ) -> NavigationTask:
     """The task of a configuration.
 
@@ -59,6 +60,7 @@ def make_task(
         planner: guides them; the expert by default.
         worlds: that `layouts` may draw from; the skill's training world by default.
         layouts: random ones from the configuration's seed by default.
+        end_on_fall: see `NavigationTask`.
     """
     robot = get_robot(config.robot)
     worlds = [parse_world(config.skill.world)] if worlds is None else list(worlds)
@@ -79,6 +81,7 @@ def make_task(
         observation_layout(config.robot, guidance),
         config.reward,
         config.threads,
+        end_on_fall,
     )
 
 

@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from hiernav.nav.mirror import Mirror
+
 KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
 
@@ -62,3 +64,13 @@ class Replay:
         # the files are the storage: only how much of them is valid has to be told
         self._storage._len = length
         self._buffer.writer.load_state_dict({"_cursor": cursor, "_write_count": length})
+
+
+def mirror_half(batch: TensorDict, mirror: Mirror) -> None:
+    """Reflect the first half of a batch (B,) of transitions left to right, in place."""
+    rows = slice(0, len(batch) // 2)
+    order, sign = torch.from_numpy(mirror.observation_index), torch.from_numpy(mirror.observation_sign)
+    for holder in (batch, batch["next"]):
+        holder["observation"][rows] = holder["observation"][rows][:, order] * sign
+    order, sign = torch.from_numpy(mirror.action_index), torch.from_numpy(mirror.action_sign)
+    batch["action"][rows] = batch["action"][rows][:, order] * sign

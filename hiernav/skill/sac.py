@@ -10,9 +10,10 @@ from tensordict import TensorDict
 from tensordict.nn import InteractionType, TensorDictModule
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, ValueEstimators
+from torchrl.objectives import ValueEstimators
 
 from hiernav.nav.observation import ObservationLayout
+from hiernav.skill.loss import DirectSACLoss
 from hiernav.skill.networks import Actor, Critic
 
 
@@ -31,7 +32,6 @@ class SacSettings:
     """None: minus the number of actions."""
     layer_norm: bool = False
     """Layer normalisation in the critics (beyond the paper)."""
-    compile: bool = False
 
 
 class Learner:
@@ -52,7 +52,7 @@ class Learner:
             spec=Bounded(-1.0, 1.0, (action_dim,)),
         )
         critic = Critic(layout, action_dim, settings.hidden, settings.layer_norm)
-        self.loss = SACLoss(
+        self.loss = DirectSACLoss(
             self.policy,
             ValueOperator(critic, in_keys=["observation", "action"]),
             loss_function="l2",
@@ -66,24 +66,19 @@ class Learner:
         self.optimizer = torch.optim.Adam(self._weights, lr=settings.learning_rate, fused=True)
         self._online = list(self.loss.qvalue_network_params.flatten_keys().values(True, True))
         self._target = list(self.loss.target_qvalue_network_params.flatten_keys().values(True, True))
-        self._losses = torch.compile(self._compute) if settings.compile else self._compute
         self.updates = 0
 
     def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
         """One gradient step on a batch (B,) of transitions; returns detached scalars."""
-        total, metrics = self._losses(batch)
+        out = self.loss(batch)
+        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(self._target, self._online, self.settings.tau)
         self.updates += 1
-        return metrics
-
-    def _compute(self, batch: TensorDict) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        out = self.loss(batch)
-        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
-        return total, {key: out[key].detach() for key in out.keys()}
+        return {key: value.detach() for key, value in out.items()}
 
     def state_dict(self) -> dict:
         """Everything a resumed run needs of the learner."""

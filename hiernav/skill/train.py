@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 
 from hiernav.config import TrainConfig
+from hiernav.nav.mirror import mirror_of
 from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.run import Run, RunError
@@ -29,7 +30,7 @@ from hiernav.sim.rollout import run_episodes
 from hiernav.sim.worlds import sample_layout
 from hiernav.skill.env import NavigationEnv
 from hiernav.skill.networks import Actor
-from hiernav.skill.replay import Replay
+from hiernav.skill.replay import Replay, mirror_half
 from hiernav.skill.sac import Learner, SacSettings
 
 _WINDOW = 200
@@ -90,7 +91,6 @@ def make_learner(config: TrainConfig) -> Learner:
         alpha_floor=skill.alpha_floor,
         target_entropy=skill.target_entropy,
         layer_norm=skill.layer_norm,
-        compile=skill.compile,
     )
     return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings)
 
@@ -115,7 +115,7 @@ class SkillTrainer:
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
         torch.manual_seed(int(seeds[0]))
         self.learner = make_learner(config)
-        self.task = make_task(config, skill.num_envs, planner)
+        self.task = make_task(config, skill.num_envs, planner, end_on_fall=skill.end_on_fall)
         self.env = NavigationEnv(self.task)
         self.replay = Replay(
             run.path / "skill" / "replay",
@@ -124,6 +124,7 @@ class SkillTrainer:
             self.task.robot.action_dim,
             skill.batch_size,
         )
+        self._mirror = mirror_of(config.robot, self.task.layout) if skill.mirror else None
         self.steps = 0
         self.evaluations: list[dict[str, float]] = []
         self.best_actor: dict[str, torch.Tensor] | None = None
@@ -216,7 +217,7 @@ class SkillTrainer:
         self._due += frames * skill.updates_per_step
         metrics: dict[str, torch.Tensor] = {}
         while self._due >= 1.0:
-            metrics = self.learner.update(self.replay.sample())
+            metrics = self.learner.update(self._batch())
             self._due -= 1.0
         values = {key: float(value) for key, value in metrics.items()}
         broken = [key for key, value in values.items() if not np.isfinite(value)]
@@ -226,6 +227,12 @@ class SkillTrainer:
                 f"the last checkpoint in {self.run.path} is from before"
             )
         return values
+
+    def _batch(self) -> TensorDict:
+        batch = self.replay.sample()
+        if self._mirror is not None:
+            mirror_half(batch, self._mirror)
+        return batch
 
     def _statistics(self, data: TensorDict) -> dict[str, float]:
         terms = data["next", "terms"].mean(0).tolist()

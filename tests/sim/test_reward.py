@@ -26,7 +26,7 @@ def terms_of(
     before: object, after: object, config: RewardConfig = DEFAULT, line: np.ndarray = STRAIGHT, **events: bool
 ) -> dict[str, float]:
     """The terms of one robot's step towards a goal at (2, 0)."""
-    flags = {name: np.array([events.get(name, False)]) for name in ("collided", "reached", "left")}
+    flags = {name: np.array([events.get(name, False)]) for name in ("collided", "reached", "left", "fallen")}
     ends = (np.array([end], float) for end in (before, after))
     terms = reward_terms(config, *ends, line, np.array([[2.0, 0.0]]), **flags)
     assert tuple(terms) == TERMS
@@ -54,7 +54,7 @@ def earned_on_a_tour(config: RewardConfig, corners: object, occupancy: Occupancy
         total = 0.0
         for position in [*tour[1:], tour[0]]:
             after = position[None]
-            terms = reward_terms(config, before, after, option.line(), goal, NO, NO, NO)
+            terms = reward_terms(config, before, after, option.line(), goal, NO, NO, NO, NO)
             total += float(weighted_sum(config, terms)[0])
             option.step(after, goal, [occupancy])
             before = after

@@ -1,0 +1,75 @@
+"""A mirrored robot in a mirrored world does the mirrored thing: checked on the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hiernav.nav.frames import world_to_body
+from hiernav.nav.lidar import lidar_closeness
+from hiernav.nav.mirror import mirror_of
+from hiernav.nav.observation import observation_layout
+from hiernav.sim.batch import BatchSim
+from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.sim.scene import scene_for
+from hiernav.sim.worlds import sample_layout
+
+STEPS = 12
+
+
+def twin(layout, flip):
+    """The layout reflected in the world plane that maps a point p to p * flip."""
+    start = np.array([*(layout.start[:2] * flip), -layout.start[2]])
+    return replace(layout, pillars=layout.pillars * flip, start=start, goal=layout.goal * flip)
+
+
+@pytest.mark.parametrize("guidance", ["waypoints", "goal"])
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidance: str) -> None:
+    spec, layout = get_robot(robot), observation_layout(robot, guidance)
+    mirror = mirror_of(robot, layout)
+    # a mirror in the world's x-z plane, or for the car in its y-z plane, turns yaw into -yaw
+    flip = np.array([-1.0, 1.0]) if robot == "car" else np.array([1.0, -1.0])
+    world = sample_layout(parse_world("pillar(2,2,10)"), 3, spec.radius)
+    worlds = [world, twin(world, flip)]
+    sim = BatchSim(spec, 2, scene_for([world.spec]))
+    sim.reset(np.arange(2), worlds)
+    rng = np.random.default_rng(0)
+    plan = world.start[:2] + np.cumsum(rng.normal(0.0, 0.1, (10, 2)), axis=0)
+
+    def observe() -> np.ndarray:
+        plans = np.stack([plan, plan * flip])
+        goals = np.stack([w.goal for w in worlds])
+        points = np.stack([w.obstacle_points(0.0) for w in worlds])
+        values = {
+            **sim.sensors,
+            "lidar": lidar_closeness(sim.pose, points),
+            "waypoints": world_to_body(plans, sim.pose).reshape(2, -1),
+            "goal": world_to_body(goals[:, None], sim.pose)[:, 0],
+        }
+        return layout.build(values)
+
+    for _ in range(STEPS):
+        action = rng.uniform(-1.0, 1.0, spec.action_dim)
+        sim.step(np.stack([action, mirror.action(action)]))
+        seen, mirrored = observe()
+        np.testing.assert_allclose(mirrored, mirror.observation(seen), atol=2e-4)
+    assert np.abs(seen).max() > 0.1
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_mirroring_twice_changes_nothing(robot: str) -> None:
+    layout = observation_layout(robot)
+    mirror = mirror_of(robot, layout)
+    seen = np.random.default_rng(0).normal(size=(5, layout.size)).astype(np.float32)
+    action = np.random.default_rng(1).normal(size=(5, len(mirror.action_index)))
+    np.testing.assert_array_equal(mirror.observation(mirror.observation(seen)), seen)
+    np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
+
+
+def test_an_unknown_robot_has_no_mirror() -> None:
+    with pytest.raises(ValueError, match="hovercraft"):
+        mirror_of("hovercraft", observation_layout("point"))
