@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
+from pathlib import Path
 
 import pytest
+import tiny_run
 from hypothesis import settings
 
 # No deadline anywhere: a claim about the robot does not depend on how busy the machine is.
@@ -30,3 +33,40 @@ def one_torch_thread(request: pytest.FixtureRequest) -> None:
         import torch
 
         torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run folder that `hiernav train` has left: all of it in miniature."""
+    from hiernav import cli
+    from hiernav.planner import train
+
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "_WALKS", 3)
+        assert cli.main(["train", *tiny_run.arguments(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def able_run(trained_run: Path) -> Path:
+    """`trained_run` with a skill that arrives in the place of the one that has hardly learnt anything."""
+    from steering import steering_actor
+
+    from hiernav.run import Run
+
+    folder = trained_run.with_name("able")
+    shutil.copytree(trained_run, folder)
+    run = Run.open(folder)
+    run.save("skill", {**run.load("skill"), "best_actor": steering_actor(run.config).state_dict()})
+    return folder
+
+
+@pytest.fixture(scope="session")
+def able_bundle(able_run: Path) -> Path:
+    """The bundle exported from `able_run`. Copy it before changing anything in it."""
+    from hiernav import cli
+
+    folder = able_run.with_name("bundle")
+    assert cli.main(["export", "--run", str(able_run), "--onnx", str(folder)]) == 0
+    return folder

@@ -1,0 +1,252 @@
+"""Claims about evaluation: honest counting, the same episodes for the same seed, from a run as from its bundle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_run
+
+from hiernav.config import TrainConfig, load_config
+from hiernav.evaluate import (
+    EPISODES,
+    Policies,
+    episode_seeds,
+    evaluate,
+    make_planner,
+    open_policies,
+    summarize,
+    wilson_interval,
+)
+from hiernav.nav.bundle import BundleError
+from hiernav.nav.observation import observation_layout
+from hiernav.nav.option import TerminationReason
+from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
+from hiernav.run import RunError
+from hiernav.sim.layout import parse_world
+from hiernav.sim.rollout import Episode
+
+WORLD = parse_world(tiny_run.WORLD)
+REASONS = [reason.name.lower() for reason in TerminationReason if reason]
+
+
+def turn_and_drive(observation: np.ndarray) -> np.ndarray:
+    """A skill whose rows are computed apart, to the last bit: turns to the fifth waypoint, drives when it is ahead."""
+    first = observation_layout("point").slices["waypoints"].start + 8
+    ahead, left = observation[:, first], observation[:, first + 1]
+    return np.stack([np.clip(10.0 * ahead - 4.0 * np.abs(left), -1.0, 1.0), np.clip(8.0 * left, -1.0, 1.0)], axis=-1)
+
+
+def policies_of(**changes: object) -> Policies:
+    config: TrainConfig = load_config(None, ["robot=point", f"skill.world={tiny_run.WORLD}"])
+    return replace(Policies(config, turn_and_drive, None), **changes)  # type: ignore[arg-type]
+
+
+def episode(**changes: object) -> Episode:
+    values: dict[str, object] = {
+        "seed": 0, "reached": True, "reason": "goal", "steps": 40, "cap": 300, "collisions": 0, "return_": 1.0,
+        "path_length": 2.0, "shortest_length": 1.0, "replans": dict.fromkeys(REASONS, 1), "refused": 0,
+        "plan_seconds": 0.1,
+    }  # fmt: skip
+    return Episode(**(values | changes))  # type: ignore[arg-type]
+
+
+def without_clock(results: dict[str, dict]) -> dict[str, dict]:
+    return {world: {key: v for key, v in row.items() if key != "seconds"} for world, row in results.items()}
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (0, 10, 0.0, 0.2775),  # Brown, Cai and DasGupta 2001
+        (10, 10, 0.7225, 1.0),
+        (8, 10, 0.4902, 0.9433),
+        (81, 263, 0.2553, 0.3662),  # Newcombe 1998, table I
+        (15, 148, 0.0624, 0.1605),
+        (1, 29, 0.0061, 0.1718),
+        (994, 1000, 0.9870, 0.9972),
+    ],
+)
+def test_the_wilson_interval_has_the_published_values(successes, trials, low, high):
+    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=6e-5)
+
+
+def test_an_interval_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="trials must be at least 1, got 0"):
+        wilson_interval(0, 0)
+
+
+def test_a_summary_counts_every_episode_once():
+    done = [
+        episode(steps=40, collisions=0, path_length=2.0, shortest_length=1.0),
+        episode(steps=60, collisions=3, path_length=0.9, shortest_length=1.0, refused=2),
+        episode(reached=False, reason="left_field", steps=10, collisions=1, return_=-1.0),
+        episode(reached=False, reason="timeout", steps=300, replans=dict.fromkeys(REASONS, 0) | {"half_index": 7}),
+    ]
+    summary = summarize(done)
+    assert summary["episodes"] == 4
+    assert summary["reach_rate"] == 0.5
+    assert summary["reach_ci95"] == list(wilson_interval(2, 4))
+    assert summary["steps_mean"] == (40 + 60 + 300 + 300) / 4  # a failure counts the cap, however early it came
+    assert summary["collisions_mean"] == 1.0
+    assert summary["collision_free_rate"] == 0.25  # reached AND untouched: the timeout without contact is none
+    assert summary["spl_mean"] == pytest.approx((0.5 + 1.0 + 0.0 + 0.0) / 4)
+    assert summary["return_mean"] == 0.5
+    assert summary["endings"] == {"goal": 2, "left_field": 1, "timeout": 1}
+    assert summary["replans"] == dict.fromkeys(REASONS, 3) | {"half_index": 10}
+    assert summary["refused"] == 2
+
+
+def test_the_seeds_of_a_short_evaluation_are_the_first_of_a_long_one():
+    np.testing.assert_array_equal(episode_seeds(5, 1000)[:20], episode_seeds(5, 20))
+    assert len(np.unique(episode_seeds(5, 1000))) == 1000
+    assert not np.array_equal(episode_seeds(6, 20), episode_seeds(5, 20))
+
+
+def test_one_world_gives_one_object_with_every_metric():
+    results = evaluate(policies_of(), [WORLD, parse_world("two-room")], planner="astar", episodes=4, rows=4)
+    assert list(results) == [tiny_run.WORLD, "two-room"]
+    for name, row in results.items():
+        assert row["world"] == name
+        assert (row["robot"], row["protocol"], row["planner"], row["seed"]) == ("point", "strict", "astar", 0)
+        assert row["episodes"] == 4
+        low, high = row["reach_ci95"]
+        assert 0.0 <= low <= row["reach_rate"] <= high <= 1.0 and low < high
+        assert row["collision_free_rate"] <= row["reach_rate"]
+        assert 0.0 <= row["spl_mean"] <= row["reach_rate"]
+        assert row["collisions_mean"] >= 0.0 and row["steps_mean"] > 1.0
+        assert list(row["replans"]) == REASONS
+        assert row["replans"]["start"] == 4
+        assert sum(row["endings"].values()) == 4
+
+
+def test_a_robot_that_follows_the_expert_arrives_by_a_short_way():
+    row = evaluate(policies_of(), [WORLD], planner="astar", episodes=12)[tiny_run.WORLD]
+    assert row["reach_rate"] == 1.0 and row["endings"] == {"goal": 12}
+    assert 10 < row["steps_mean"] < 120
+    assert row["spl_mean"] > 0.7
+    still = policies_of(skill=lambda observation: np.zeros((len(observation), 2)))
+    row = evaluate(still, [WORLD], planner="astar", episodes=3)[tiny_run.WORLD]
+    assert row["reach_rate"] == 0.0 and row["steps_mean"] == WORLD.max_steps and row["spl_mean"] == 0.0
+
+
+@pytest.mark.parametrize("world", [tiny_run.WORLD, "gremlin(1.5,1.5,3)"])
+def test_the_same_seed_gives_the_same_episodes_however_many_run_side_by_side(world):
+    spec, kept = parse_world(world), {}
+    for rows in (64, 5, 1):
+        episodes: dict[int, Episode] = {}
+
+        def keep(_, index, done, episodes=episodes):
+            episodes[index] = replace(done, plan_seconds=0.0)
+
+        results = evaluate(policies_of(), [spec], planner="astar", episodes=8, seed=2, rows=rows, on_episode=keep)
+        kept[rows] = (without_clock(results), [episodes[index] for index in range(8)])
+    assert kept[64] == kept[5] == kept[1]
+    assert len({e.steps for e in kept[1][1]}) > 2
+    other = evaluate(policies_of(), [spec], planner="astar", episodes=8, seed=3)
+    assert without_clock(other) != kept[64][0]
+
+
+def test_contacts_with_gremlins_count_under_the_strict_protocol_alone():
+    """Robots that drive on whatever comes hit gremlins and pillars alike."""
+    into = parse_world("gremlin(1.5,1.5,4)")
+
+    def charge(observation: np.ndarray) -> np.ndarray:
+        return np.tile([1.0, 0.1], (len(observation), 1))
+
+    counts = {}
+    for protocol in ("paper", "strict"):
+        for world in (into, parse_world("pillar(1.2,1.2,2)")):
+            row = evaluate(policies_of(skill=charge), [world], protocol, "astar", episodes=6)[str(world)]
+            counts[protocol, world.kind] = row["collisions_mean"]
+    assert counts["strict", "gremlin"] > 0.0 == counts["paper", "gremlin"]
+    assert counts["strict", "pillar"] == counts["paper", "pillar"] > 0.0
+
+
+def test_each_protocol_has_its_number_of_episodes(monkeypatch):
+    driven: list[int] = []
+
+    def drive(task, skill, layouts, on_episode):
+        driven.append(len(layouts))
+        return [episode() for _ in layouts]
+
+    monkeypatch.setattr("hiernav.evaluate.run_episodes", drive)
+    for protocol in ("paper", "strict"):
+        row = evaluate(policies_of(), [parse_world("pillar(1.2,1.2,0)")], protocol, "astar", rows=2)
+        assert row["pillar(1.2,1.2,0)"]["episodes"] == EPISODES[protocol]
+    assert driven == [200, 1000]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"protocol": "loose"}, "unknown protocol 'loose'; known: paper, strict"),
+        ({"planner": "rrt"}, "unknown planner 'rrt'; known: cnn, astar"),
+        ({"planner": "cnn"}, "hold no planner network: train the planner first, or use --planner astar"),
+        ({"episodes": 0}, "episodes must be at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(policies_of(), [WORLD], **({"planner": "astar", "episodes": 1} | arguments))
+
+
+def test_a_folder_that_is_neither_run_nor_bundle_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"neither a run folder .*config\.yaml.* nor a bundle .*manifest\.json"):
+        open_policies(tmp_path)
+    with pytest.raises(BundleError, match="no such folder"):
+        open_policies(tmp_path / "absent")
+
+
+@pytest.mark.train
+def test_a_run_without_a_trained_skill_is_refused_with_a_hint(tmp_path):
+    from hiernav.run import Run
+
+    run = Run.create(tiny_run.config(tmp_path / "run"))
+    with pytest.raises(RunError, match=f"no trained skill yet: go on with `hiernav train --resume {run.path}`"):
+        open_policies(run.path)
+
+
+@pytest.mark.train
+def test_the_network_plans_verified_or_alone(able_run: Path):
+    policies = open_policies(able_run)
+    verified = make_planner(policies, "cnn")
+    assert isinstance(verified, VerifiedPlanner) and isinstance(verified.planner, GoseloPlanner)
+    assert verified.radius == 0.1
+    assert isinstance(make_planner(policies, "cnn", repair=False), GoseloPlanner)
+    assert isinstance(make_planner(policies, "astar"), ShortestPathPlanner)
+    dense = parse_world("pillar(1.5,1.5,8)")
+    checked, alone = (evaluate(policies, [dense], episodes=6, repair=repair)[str(dense)] for repair in (True, False))
+    assert checked["proposals"] >= checked["repairs"] > 0
+    assert checked["proposals"] == sum(checked["replans"].values()) - checked["replans"]["goal"]
+    assert "proposals" not in alone
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("planner", ["cnn", "astar"])
+def test_a_run_and_its_bundle_drive_the_same_episodes(able_run: Path, able_bundle: Path, planner):
+    """Few pillars: where robots touch, differences of a millionth between the two libraries may grow."""
+    driven = {}
+    for source in (able_run, able_bundle):
+        episodes: dict[int, Episode] = {}
+
+        def keep(_, index, done, episodes=episodes):
+            episodes[index] = done
+
+        row = evaluate(open_policies(source), [WORLD], planner=planner, episodes=12, on_episode=keep)[str(WORLD)]
+        driven[source] = (
+            row["reach_rate"],
+            [(episodes[k].seed, episodes[k].reached, episodes[k].steps) for k in range(12)],
+        )
+        assert row["replans"]["start"] == 12
+    assert driven[able_run] == driven[able_bundle]
+    assert open_policies(able_bundle).config.option == open_policies(able_run).config.option
+
+
+@pytest.mark.train
+def test_a_bundle_for_another_model_of_the_robot_is_refused(able_bundle: Path, monkeypatch):
+    monkeypatch.setattr("hiernav.evaluate.file_sha256", lambda path: "0" * 64)
+    with pytest.raises(BundleError, match="robot_sha256: the model of 'point' has changed since training"):
+        open_policies(able_bundle)
