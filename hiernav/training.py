@@ -11,6 +11,8 @@ from hiernav.planner import train as planner_train
 from hiernav.run import Run
 from hiernav.skill import train as skill_train
 
+_LINE_SECONDS = 30.0
+
 
 def train(run: Run, stage: str, progress: Progress) -> None:
     """Train "planner", "skill" or "all" of a run, from its last checkpoints on.
@@ -43,33 +45,36 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
 
 
-class _PlannerDisplay:
+class _Display:
+    """One bar per stage on a terminal; a line every half minute elsewhere."""
+
     def __init__(self, progress: Progress) -> None:
         self.progress = progress
         self._tasks: dict[str, TaskID] = {}
+        self._printed = time.perf_counter()
 
+    def show(self, stage: str, done: int, total: int, note: str) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = self.progress.add_task(stage, total=total, note="")
+        self.progress.update(self._tasks[stage], completed=done, note=note)
+        if not self.progress.console.is_terminal and time.perf_counter() - self._printed > _LINE_SECONDS:
+            self._printed = time.perf_counter()
+            left = self.progress.tasks[self._tasks[stage]].time_remaining
+            ahead = "" if left is None else f"  {left / 60:.1f} min left"
+            self.progress.console.print(f"{stage} {done:,} of {total:,}  {note}{ahead}", highlight=False)
+
+
+class _PlannerDisplay(_Display):
     def __call__(self, now: planner_train.Progress) -> None:
-        if now.stage not in self._tasks:
-            self._tasks[now.stage] = self.progress.add_task(f"planner: {now.stage}", total=now.total, note="")
-        task = self._tasks[now.stage]
-        speed = self.progress.tasks[task].speed or 0.0
-        note = f"{speed:,.0f} samples/s"
-        if now.stage == "training":
-            note += f"  loss {now.loss:.4f}"
-        if now.error is not None:
-            note += f"  error {100 * now.error:.1f} cm"
-        self.progress.update(task, completed=now.done, note=note)
+        rate = f"{now.samples_per_second:,.0f} samples/s"
+        loss = f"  loss {now.loss:.4f}" if now.loss is not None else ""
+        error = f"  error {100 * now.error:.1f} cm" if now.error is not None else ""
+        self.show(f"planner: {now.stage}", now.done, now.total, rate + loss + error)
 
 
-class _SkillDisplay:
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
-        self._task: TaskID | None = None
-
+class _SkillDisplay(_Display):
     def __call__(self, now: skill_train.Progress) -> None:
-        if self._task is None:
-            self._task = self.progress.add_task("skill", total=now.total_steps, note="")
         note = f"{now.steps_per_second:,.0f} steps/s  {now.updates:,} updates  reach {now.reach_rate:.3f}"
         if now.evaluation is not None:
             note += f"  evaluated {now.evaluation:.3f}"
-        self.progress.update(self._task, completed=now.steps, note=note)
+        self.show("skill", now.steps, now.total_steps, note)

@@ -38,7 +38,8 @@ class Progress:
     stage: str
     done: int
     total: int
-    loss: float
+    samples_per_second: float
+    loss: float | None
     error: float | None
     """Mean distance of the chosen waypoints from the label on validation worlds [m]."""
 
@@ -97,9 +98,12 @@ class PlannerTrainer:
             return
         planner, seed = self.config.planner, self.config.seed
 
-        def report(stage: str, done: int, total: int, loss: float = float("nan")) -> None:
+        began = time.perf_counter()
+
+        def report(stage: str, done: int, total: int, first: int = 0, loss: float | None = None) -> None:
             if on_progress is not None:
-                on_progress(Progress(stage, done, total, loss, self.validation.get("error")))
+                rate = (done - first) / max(time.perf_counter() - began, 1e-6)
+                on_progress(Progress(stage, done, total, rate, loss, self.validation.get("error")))
 
         samples = make_samples(
             self.labels,
@@ -109,9 +113,9 @@ class PlannerTrainer:
             lambda done: report("data set", done, planner.samples),
         )
         held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
-        total = planner.epochs * planner.samples
+        began, first, total = time.perf_counter(), self.epoch * planner.samples, planner.epochs * planner.samples
         while not self.finished:
-            loss = self._epoch(samples, lambda done, now: report("training", done, total, now))
+            loss = self._epoch(samples, lambda done, now: report("training", done, total, first, now))
             self.epoch += 1
             self.validation = {"loss": loss, **self._validate(held_out)}
             if self.finished:

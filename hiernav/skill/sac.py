@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,6 +33,10 @@ class SacSettings:
     """None: minus the number of actions."""
     layer_norm: bool = False
     """Layer normalisation in the critics (beyond the paper)."""
+
+
+# Learner moves the targets itself: one fused operation instead of torchrl's updater, which takes ten times as long.
+warnings.filterwarnings("ignore", "No target network updater", UserWarning)
 
 
 class Learner:

@@ -180,7 +180,8 @@ class SkillTrainer:
             self.learner.policy,
             frames_per_batch=per_batch,
             total_frames=max(1, frames // per_batch) * per_batch,
-            init_random_frames=max(0, skill.learning_starts - self.steps),
+            init_random_frames=-(-max(0, skill.learning_starts - self.steps) // per_batch) * per_batch,
+            auto_register_policy_transforms=False,
         )
         window: list[TensorDict] = []
         try:
