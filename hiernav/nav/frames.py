@@ -22,8 +22,10 @@ def world_to_body(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """
     delta = points - pose[:, None, :2]
     cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
-    dx, dy = delta[..., 0], delta[..., 1]
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+    out = np.empty(delta.shape)
+    out[..., 0] = cos * delta[..., 0] + sin * delta[..., 1]
+    out[..., 1] = cos * delta[..., 1] - sin * delta[..., 0]
+    return out
 
 
 def body_to_world(points: np.ndarray, pose: np.ndarray) -> np.ndarray:

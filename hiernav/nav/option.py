@@ -34,6 +34,10 @@ class TerminationReason(IntEnum):
     GOAL = 5
 
 
+# Looking a member up takes longer than the comparison it is used in, and the robot does so at every tick.
+_NONE, _START, _D_UPDATE, _HALF_INDEX, _INVALID, _GOAL = (int(reason) for reason in TerminationReason)
+
+
 @dataclass(frozen=True)
 class ReplanRule:
     """When an option ends: a rule without learned parts.
@@ -80,18 +84,15 @@ class ReplanRule:
             used_up = index > self.half_fraction * count
         else:
             too_far, used_up = np.isnan(distance), age >= self.period
-        reason = np.select(
-            [~started, at_goal, blocked & self.invalid, too_far, used_up],
-            [
-                TerminationReason.START,
-                TerminationReason.GOAL,
-                TerminationReason.INVALID,
-                TerminationReason.D_UPDATE,
-                TerminationReason.HALF_INDEX,
-            ],
-            TerminationReason.NONE,
-        )
-        return reason.astype(np.int8)
+        reason = np.zeros(len(distance), dtype=np.int8)
+        # the last one that holds stays: from the least to the most important
+        reason[used_up] = _HALF_INDEX
+        reason[too_far] = _D_UPDATE
+        if self.invalid:
+            reason[blocked] = _INVALID
+        reason[at_goal] = _GOAL
+        reason[~started] = _START
+        return reason
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ class WaypointOption:
         self.age[rows] += 1
         reason = self._reasons(rows, position, goal, occupancy)
         self.counts[rows, reason] += 1
-        due = np.flatnonzero((reason != TerminationReason.NONE) & (reason != TerminationReason.GOAL))
+        due = np.flatnonzero((reason != _NONE) & (reason != _GOAL))
         began = time.perf_counter()
         if len(due):
             self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
@@ -289,7 +290,7 @@ class AgentStep:
     @property
     def replanned(self) -> np.ndarray:
         """(N,) bool."""
-        return (self.reason != TerminationReason.NONE) & (self.reason != TerminationReason.GOAL)
+        return (self.reason != _NONE) & (self.reason != _GOAL)
 
     @property
     def plan_seconds(self) -> float:
@@ -332,8 +333,5 @@ def guided(
     terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Add what guides the skill to its sensors: waypoints and goal, re-expressed in the present body frame."""
-    return {
-        **terms,
-        "waypoints": world_to_body(plan, pose).reshape(len(pose), -1),
-        "goal": world_to_body(np.asarray(goal, dtype=np.float64)[:, None], pose)[:, 0],
-    }
+    guides = world_to_body(np.concatenate([plan, np.asarray(goal, dtype=np.float64)[:, None]], axis=1), pose)
+    return {**terms, "waypoints": guides[:, :-1].reshape(len(pose), -1), "goal": guides[:, -1]}
