@@ -1,11 +1,13 @@
 """Hierarchical navigation: a learned waypoint planner over a learned locomotion skill.
 
-The public names are imported when they are first used; importing `hiernav` itself loads nothing but this file.
+The public names are imported when they are first used. Importing `hiernav` itself loads nothing but this file, and
+where Gymnasium is installed (never on a robot) registers the environments with it.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -72,3 +74,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+if find_spec("gymnasium") is not None:
+    import_module("hiernav.envs")

@@ -70,3 +70,19 @@ def able_bundle(able_run: Path) -> Path:
     folder = able_run.with_name("bundle")
     assert cli.main(["export", "--run", str(able_run), "--onnx", str(folder)]) == 0
     return folder
+
+
+@pytest.fixture(scope="session")
+def doggo_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with the paper's networks for the doggo, untrained. Copy it before changing anything in it."""
+    import torch
+
+    from hiernav.export import write_bundle
+    from hiernav.planner.network import make_network
+    from hiernav.skill.train import make_learner
+
+    folder = tmp_path_factory.mktemp("doggo")
+    config = tiny_run.config(folder, "robot=doggo", "planner.preset=paper")
+    torch.manual_seed(0)
+    write_bundle(folder, config, make_network("paper", 10, 0.1, 1), make_learner(config).actor, {})
+    return folder

@@ -1,8 +1,4 @@
-"""Gymnasium environments on the navigation task. Importing this module registers them.
-
-`gymnasium.make("hiernav.sim.gym:hiernav/PointPillar-v0")` imports it as well. Names are robot and world: Point, Car or
-Doggo, then Pillar, Gremlin, TwoRoom or FourRoom; `world=` takes any other world.
-"""
+"""The navigation task as a Gymnasium environment; `hiernav.envs` registers it."""
 
 from __future__ import annotations
 
@@ -20,8 +16,6 @@ from hiernav.sim.layout import GOAL_RADIUS, Layout, parse_world
 from hiernav.sim.task import NavigationTask
 from hiernav.sim.worlds import sample_layout
 
-ROBOTS = {"Point": "point", "Car": "car", "Doggo": "doggo"}
-WORLDS = {"Pillar": "pillar(2,2,10)", "Gremlin": "gremlin", "TwoRoom": "two-room", "FourRoom": "four-room"}
 FRAME = 480
 """Longer side of a rendered image [px]."""
 
@@ -125,12 +119,3 @@ def draw_from_above(layout: Layout, time: float, pose: np.ndarray, radius: float
     cv2.circle(image, pixel(pose), max(2, round(radius * scale)), (220, 60, 40), -1, cv2.LINE_AA)
     cv2.line(image, pixel(pose), pixel(nose), (255, 255, 255), 2, cv2.LINE_AA)
     return image
-
-
-for _robot, _robot_name in ROBOTS.items():
-    for _world, _world_name in WORLDS.items():
-        gymnasium.register(
-            id=f"hiernav/{_robot}{_world}-v0",
-            entry_point=f"{__name__}:NavigationGymEnv",
-            kwargs={"robot": _robot_name, "world": _world_name},
-        )

@@ -15,8 +15,9 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from hiernav.config import TrainConfig, load_config  # noqa: E402
+from hiernav.envs import ROBOTS, WORLDS  # noqa: E402
 from hiernav.sim.factory import make_task  # noqa: E402
-from hiernav.sim.gym import ROBOTS, WORLDS, NavigationGymEnv  # noqa: E402
+from hiernav.sim.gym import NavigationGymEnv  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
 
 
@@ -44,10 +45,10 @@ def test_every_name_is_its_robot_in_its_world(robot: str, world: str) -> None:
     assert info["reason"] == "start"
 
 
-def test_a_plain_import_of_gymnasium_and_the_module_in_the_name_are_enough() -> None:
+def test_importing_hiernav_registers_the_environments_without_torch() -> None:
     code = (
-        "import sys, gymnasium\n"
-        "env = gymnasium.make('hiernav.sim.gym:hiernav/PointPillar-v0')\n"
+        "import sys, gymnasium, hiernav\n"
+        "env = gymnasium.make('hiernav/PointPillar-v0')\n"
         "print(env.reset(seed=1)[0].shape, 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
