@@ -16,7 +16,7 @@ from hiernav.nav.occupancy import OccupancyMap, VisitMap, draw_boxes, empty_map
 ALL = (*CHANNELS, "clearance_local")
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-np.pi, np.pi)
-LARGE = (9.0, 9.0)
+LARGE = (12.0, 12.0)  # whatever is seen in these tests lies in it
 
 
 def image_of(
