@@ -171,11 +171,12 @@ def test_where_everything_is_occupied_there_is_no_path() -> None:
 
 
 @given(seeds)
-def test_in_a_free_map_the_smoothed_path_is_straight(seed: int) -> None:
+def test_in_a_free_map_the_smoothed_path_is_almost_straight(seed: int) -> None:
     start, goal = np.random.default_rng(seed).uniform(-1.8, 1.8, (2, 2))
     field = PathField(map_with_pillars(half_size=(2.0, 2.0)), goal, RADIUS)
     path = field.smooth(field.path_from(start))
-    assert length_of(path) <= 1.05 * np.linalg.norm(goal - start) + 0.02
+    # lines of up to 24 cells between cells of a grid path, which alone may be 8 % longer
+    assert length_of(path) <= 1.07 * np.linalg.norm(goal - start) + 0.02
 
 
 @given(seeds)
