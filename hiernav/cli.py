@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -227,11 +228,13 @@ def _config(arguments: argparse.Namespace) -> int:
         print(dump_config(load_config(arguments.config, arguments.overrides)), end="")
         return 0
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table("key", "type", "default", "what it is", box=None, pad_edge=False)
     for setting in describe_config():
-        table.add_row(setting.path, setting.type, str(setting.default), setting.description)
+        # escaped: units in brackets are no markup
+        table.add_row(*map(escape, (setting.path, setting.type, str(setting.default), setting.description)))
     Console().print(table)
     return 0
 
@@ -299,7 +302,8 @@ def _write_json(path: Path, value: Any) -> None:
     partial.replace(path)
 
 
-def _progress() -> Progress:
+@contextmanager
+def _progress() -> Iterator[Progress]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -310,7 +314,7 @@ def _progress() -> Progress:
         TimeRemainingColumn,
     )
 
-    return Progress(
+    progress = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -320,6 +324,14 @@ def _progress() -> Progress:
         TextColumn("{task.fields[note]}"),
         console=Console(stderr=True),
     )
+    with progress:
+        try:
+            yield progress
+        except (ValueError, OSError):
+            # bad input: the error is all there is to see
+            progress.live.transient = True
+            progress.console.quiet = not progress.console.is_interactive
+            raise
 
 
 def _one_line(error: Exception) -> str:

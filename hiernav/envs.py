@@ -1,6 +1,6 @@
 """Registers the task with Gymnasium, so that `gymnasium.make("hiernav/PointPillar-v0")` works after `import hiernav`.
 
-Names are robot and world: Point, Car or Doggo, then Pillar, Gremlin, TwoRoom or FourRoom; `world=` takes any other world.
+Names are robot and world: Point, Car or Doggo, then Pillar, Gremlin, TwoRoom or FourRoom; `world=` takes any other.
 Nothing of the simulation is imported before an environment is made.
 """
 

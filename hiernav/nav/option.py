@@ -135,7 +135,7 @@ class OptionStep:
 class WaypointOption:
     """Plans of N robots: when each one ends, a new one is asked for.
 
-    A row whose planner finds nothing (NaN), or whose position is not finite, keeps the plan it has, or holds its
+    A row whose planner finds nothing (NaN) or nonsense, or whose position is not finite, keeps the plan it has, or holds its
     position if it has none, and asks again at the next step; such refusals are counted.
     """
 
@@ -147,6 +147,8 @@ class WaypointOption:
     """A robot this close to its goal has reached it [m]."""
     sweep_radius: float = 0.1
     """Radius with which the remaining plan is swept for `invalid` [m]."""
+    max_reach: float = 10.0
+    """A plan with a waypoint farther than this from the robot, in x or y, is refused [m]."""
 
     def __post_init__(self) -> None:
         shape = (self.num_rows, self.num_waypoints, 2)
@@ -157,6 +159,8 @@ class WaypointOption:
         self.visits: list[VisitMap | None] = [None] * self.num_rows
         self.counts = np.zeros((self.num_rows, len(TerminationReason)), dtype=np.int64)
         self.refused = np.zeros(self.num_rows, dtype=np.int64)
+        self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
+        self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
         self._hit = np.zeros(self.num_rows, dtype=np.int64)  # last waypoint (from 1) that meets it, 0 if none does
 
@@ -216,8 +220,9 @@ class WaypointOption:
     ) -> np.ndarray:
         index, distance = path.nearest_vertex(position[:, None], path.polyline(self.start[rows], self.plan[rows]))
         blocked = self._sweep(rows, occupancy) >= np.maximum(index[:, 0], 1)
-        # a blocked plan that was made where the robot still stands would only be proposed again
-        blocked &= (self.age[rows] > 1) & (np.linalg.norm(position - self.start[rows], axis=-1) > 0.05)
+        # on the map it was made for and where it was made, a blocked plan would only be proposed again
+        moved = np.linalg.norm(position - self.start[rows], axis=-1) > 0.05
+        blocked &= (self.age[rows] > 1) & (moved | self._changed[rows])
         return self.rule(
             distance[:, 0],
             index[:, 0],
@@ -235,6 +240,7 @@ class WaypointOption:
                 if self._swept[row] is not now:
                     met = np.flatnonzero(~now.is_free(self.plan[row], self.sweep_radius))
                     self._hit[row] = met[-1] + 1 if len(met) else 0
+                    self._changed[row] = now is not self._planned_on[row]
                     self._swept[row] = now
         return self._hit[rows]
 
@@ -256,7 +262,8 @@ class WaypointOption:
             if proposed.shape != plan[known].shape:
                 raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
             plan[known] = proposed
-        good = np.isfinite(plan).all(axis=(1, 2))
+        # not "> max_reach", so that NaN is refused too
+        good = (np.abs(plan - position[:, None]) <= self.max_reach).all(axis=(1, 2))
         self.refused[rows[~good]] += 1
         hold = ~good & ~np.isfinite(self.plan[rows]).all(axis=(1, 2))
         plan[hold] = position[hold][:, None]
@@ -265,8 +272,8 @@ class WaypointOption:
         self.start[rows[accepted]] = position[accepted]
         self.started[rows[good]] = True
         self.age[rows[accepted]] = 0
-        for row in rows[accepted].tolist():
-            self._swept[row] = None
+        for k in np.flatnonzero(accepted).tolist():
+            self._swept[rows[k]], self._planned_on[rows[k]] = None, occupancy[k]
 
 
 @dataclass

@@ -286,3 +286,22 @@ def test_the_line_of_an_option_is_its_plan_behind_its_start() -> None:
     drive = Drive(num_rows=2)
     drive.at((0.0, 0.0), (0.3, 0.1))
     assert_array_equal(drive.option.line(), polyline(drive.option.start, drive.option.plan))
+
+
+def test_an_obstacle_that_comes_while_the_robot_stands_ends_the_plan_at_once() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    assert drive.at((0.0, 0.0)) == [NONE]
+    drive.map = map_with_pillars((0.8, 0.0))
+    assert drive.at((0.0, 0.0)) == [INVALID]
+
+
+@pytest.mark.parametrize("far", [10.5, 1e9, np.inf, -1e300])
+def test_a_plan_that_leads_out_of_reach_is_refused(far: float) -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    kept = drive.option.plan.copy()
+    drive.planner.plan = lambda query: np.full((1, 10, 2), far)  # type: ignore[method-assign]
+    drive.at((0.7, 0.0))
+    assert_array_equal(drive.option.plan, kept)
+    assert drive.option.refused == [1]
