@@ -1,0 +1,371 @@
+"""Claims about the command line: every bad input is one line that says what to do, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_run
+
+from hiernav import cli
+from hiernav.config import describe_config, load_config
+from hiernav.evaluate import wilson_interval
+
+COMMANDS = ("train", "evaluate", "export", "world", "config")
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Runs a command line that must be refused, in `tmp_path`; returns its one line on stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: object) -> str:
+        before = contents(tmp_path)
+        capsys.readouterr()
+        assert cli.main([str(argument) for argument in arguments]) == 2
+        line = capsys.readouterr().err
+        assert line.endswith("\n") and line.count("\n") == 1, line
+        assert line.startswith(f"hiernav {arguments[0]}: ")
+        assert contents(tmp_path) == before
+        return line
+
+    return run
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() if file.is_file() else b"" for file in folder.rglob("*")}
+
+
+def write_map(folder: Path, occupied: np.ndarray) -> Path:
+    """A map_server map of 0.05 m per pixel; row 0 of `occupied` is the top."""
+    rows, cols = occupied.shape
+    pixels = np.where(occupied, 0, 254).astype(np.uint8)
+    (folder / "hall.pgm").write_bytes(b"P5\n%d %d\n255\n" % (cols, rows) + pixels.tobytes())
+    (folder / "hall.yaml").write_text(
+        "image: hall.pgm\nresolution: 0.05\norigin: [0.0, 0.0, 0.0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    return folder / "hall.yaml"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (None, ["robot.yaml: cannot be read: No such file"]),
+        ("skill: {tau: 0.1\n", ["robot.yaml:2: malformed YAML", "expected"]),
+        ("skill: {num_env: 3}\n", ["robot.yaml: unknown key 'skill.num_env', did you mean 'skill.num_envs'?"]),
+        ("skill: {num_envs: many}\n", ["robot.yaml: skill.num_envs = 'many', expected int >= 1"]),
+        ("planner: {hypotheses: 17}\n", ["robot.yaml: planner.hypotheses = 17, expected int >= 1 and <= 16"]),
+        ("robot: ant\n", ["robot.yaml: robot = 'ant', expected car | doggo | point"]),
+        ("skill: {world: maze}\n", ["robot.yaml: skill.world = 'maze', expected a world: pillar(2,2,10)"]),
+        ("planner: {worlds: [maze]}\n", ["robot.yaml: planner.worlds = ['maze'], expected", "pillar(2,2,10)"]),
+    ],
+)
+@pytest.mark.parametrize("command", ["train", "config"])
+def test_a_configuration_that_cannot_be_used_is_named_by_file_and_key(refused, tmp_path, command, text, parts):
+    if text is not None:
+        (tmp_path / "robot.yaml").write_text(text)
+    line = refused(command, "--config", "robot.yaml")
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("skill.num_envs=0", "command line: skill.num_envs = 0, expected int >= 1"),
+        ("skil.tau=1", "command line: unknown key 'skil.tau', did you mean 'skill.tau'?"),
+        ("tau", "command line: 'tau', expected key.path=value"),
+        ("robot=ant", "command line: robot = 'ant', expected car | doggo | point"),
+        (
+            "skill.world=pillar(2,2)",
+            "skill.world = 'pillar(2,2)': world 'pillar(2,2)': 2 arguments, pillar(W,H,N) takes 3",
+        ),
+        (
+            "skill.world=pillar(0.6,0.6,9)",
+            "skill.world = 'pillar(0.6,0.6,9)': .* use fewer obstacles or a larger field",
+        ),
+        ("planner.planning_radius_m=3", "planner.worlds = 'pillar.*none of 100 layouts .* a smaller robot"),
+        (
+            "skill.world=map(hall.yaml)",
+            "skill.world = 'map(hall.yaml)': .*: the map file cannot be read",
+        ),
+    ],
+)
+def test_training_refuses_a_setting_before_it_makes_a_folder(refused, override, part):
+    line = refused("train", *tiny_run.SETTINGS, override)
+    first, *rest = part.split(".*")
+    assert first in line and all(piece.strip() in line for piece in rest)
+
+
+@pytest.mark.parametrize("command", ["world", "train", "evaluate"])
+def test_a_map_without_a_way_from_start_to_goal_is_refused(refused, tmp_path, request, command):
+    write_map(tmp_path, np.ones((40, 40), dtype=bool))
+    world = "map(hall.yaml)"
+    if command == "world":
+        line = refused("world", "--kind", world, "--png", "out.png")
+    elif command == "train":
+        line = refused("train", *tiny_run.SETTINGS, f"skill.world={world}")
+    else:
+        bundle = request.getfixturevalue("able_bundle")
+        line = refused("evaluate", "--bundle", bundle, "--world", world, "--episodes", 1, "--json", "out.json")
+    assert "world map(hall.yaml): no place is free for a robot of radius 0.1 m" in line and "use another map" in line
+
+
+def test_a_map_of_two_rooms_without_a_door_still_gives_tasks_within_a_room(tmp_path, capsys):
+    occupied = np.zeros((60, 80), dtype=bool)
+    occupied[:, 39:41] = True
+    assert cli.main(["world", "--kind", str(write_map(tmp_path, occupied)), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["start"][0] < 1.95) == (shown["goal"][0] < 1.95)
+
+
+@pytest.mark.parametrize("world", ["maze", "pillar", "pillar(2,2,-1)", "pillar(0.1,2,3)", "pillar(2,x,3)", "none.yaml"])
+@pytest.mark.parametrize("command", ["world", "evaluate"])
+def test_an_unknown_world_is_refused_with_what_is_accepted(refused, command, world):
+    """Before the policies are opened: there are none here."""
+    line = refused("world", "--kind", world) if command == "world" else refused(
+        "evaluate", "--bundle", "nowhere", "--world", world
+    )  # fmt: skip
+    assert world in line
+    assert any(hint in line for hint in ("accepted are pillar(W,H,N)", "must be between", "cannot be read"))
+
+
+@pytest.mark.parametrize(("option", "value"), [("--seed", "-1"), ("--radius", "0"), ("--radius", "nan")])
+def test_a_world_of_impossible_numbers_is_refused(refused, option, value):
+    line = refused("world", option, value)
+    assert "must" in line and value in line
+
+
+@pytest.mark.train
+def test_an_existing_run_is_not_overwritten(refused, trained_run, tmp_path):
+    shutil.copytree(trained_run, tmp_path / "run")
+    line = refused("train", *tiny_run.arguments(Path("run"), "seed=9"))
+    assert "run holds a run already: go on with --resume run, or choose another run_dir" in line
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("extra", [["skill.total_steps=9"], ["--config", "robot.yaml"]])
+def test_going_on_with_other_settings_is_refused(refused, trained_run, extra):
+    line = refused("train", "--resume", trained_run, *extra)
+    assert "takes its configuration from the run folder: leave out --config and KEY=VALUE" in line
+
+
+@pytest.mark.train
+def test_a_folder_that_is_no_run_is_refused_wherever_a_run_is_asked_for(refused, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder in ("empty", "absent"):
+        assert "is not a run folder: it has no config.yaml" in refused("train", "--resume", folder)
+        assert "is not a run folder: it has no config.yaml" in refused("export", "--run", folder, "--onnx", "bundle")
+        line = refused("evaluate", "--run", folder, "--json", "out.json")
+        assert "neither a run folder" in line or "no such folder" in line
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("missing", ["planner", "skill"])
+def test_an_incomplete_run_is_refused_with_how_to_complete_it(refused, trained_run, tmp_path, missing):
+    shutil.copytree(trained_run, tmp_path / "run")
+    (tmp_path / "run" / missing / "checkpoint.pt").unlink()
+    line = refused("export", "--run", "run", "--onnx", "bundle")
+    assert f"run has no trained {missing} yet: go on with `hiernav train --resume run`" in line
+    line = refused("evaluate", "--run", "run", "--episodes", 1, "--json", "out.json")
+    assert ("train the planner first, or use --planner astar" if missing == "planner" else "--resume run`") in line
+
+
+@pytest.mark.train
+def test_a_run_with_a_damaged_checkpoint_is_refused(refused, trained_run, tmp_path):
+    shutil.copytree(trained_run, tmp_path / "run")
+    checkpoint = tmp_path / "run" / "skill" / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    for command in (
+        ("train", "--resume", "run"),
+        ("export", "--run", "run", "--onnx", "b"),
+        ("evaluate", "--run", "run"),
+    ):
+        line = refused(*command)
+        assert "skill/checkpoint.pt cannot be read" in line and "restore it, or remove it" in line
+
+
+@pytest.mark.train
+def test_a_bundle_that_must_not_be_used_is_refused(refused, able_bundle, tmp_path):
+    bundle = Path(shutil.copytree(able_bundle, tmp_path / "bundle"))
+    manifest = json.loads((bundle / "manifest.json").read_text())
+    (bundle / "manifest.json").write_text(json.dumps(manifest | {"format_version": 2}))
+    line = refused("evaluate", "--bundle", "bundle", "--json", "out.json")
+    assert "format_version 2 was made by a newer hiernav" in line and "upgrade hiernav" in line
+    (bundle / "manifest.json").write_text(json.dumps(manifest))
+    (bundle / "skill.onnx").write_bytes((bundle / "skill.onnx").read_bytes()[:-1])
+    assert "skill.onnx: SHA-256 differs" in refused("evaluate", "--bundle", "bundle", "--json", "out.json")
+    line = refused("evaluate", "--bundle", able_bundle, "--robot", "car")
+    assert "these policies are for robot 'point', not 'car'" in line
+    assert "episodes must be at least 1, got 0" in refused("evaluate", "--bundle", able_bundle, "--episodes", 0)
+
+
+def test_a_world_is_drawn_and_the_seed_decides_it(tmp_path, capsys):
+    drawn = []
+    for seed, name in ((7, "a.png"), (7, "b.png"), (8, "c.png")):
+        file = tmp_path / name
+        assert cli.main(["world", "--kind", "four-room", "--seed", str(seed), "--png", str(file)]) == 0
+        assert capsys.readouterr().out == f"wrote {file}\n"
+        drawn.append(file.read_bytes())
+    assert drawn[0].startswith(b"\x89PNG\r\n\x1a\n") and len(drawn[0]) > 5_000
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_a_world_is_printed_as_json(capsys):
+    assert cli.main(["world", "--kind", "gremlin(2,2,4)", "--seed", "7", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["world"], shown["seed"], shown["max_steps"]) == ("gremlin(2,2,4)", 7, 300)
+    assert len(shown["gremlins"]) == 4 and shown["pillars"] == shown["walls"] == []
+    assert len(shown["start"]) == 3 and len(shown["goal"]) == 2
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main([command, "--help"])
+    assert left.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: hiernav {command}") and "-h, --help" in text
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    overview = capsys.readouterr().out
+    assert all(f"\n    {each} " in overview for each in COMMANDS)
+    options = {word.strip("[],") for word in text.split() if word.startswith("--")}
+    assert options >= {"evaluate": {"--bundle", "--run", "--world", "--json"}, "export": {"--run", "--onnx"}}.get(
+        command, set()
+    )
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["export", "--run", "x"], ["evaluate"], ["world", "--seed", "one"]])
+def test_a_command_line_that_makes_no_sense_exits_with_usage(arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert left.value.code == 2
+    assert "usage: hiernav" in capsys.readouterr().err
+
+
+def test_config_lists_every_setting(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "240")
+    assert cli.main(["config"]) == 0
+    shown = capsys.readouterr().out
+    for setting in describe_config():
+        assert setting.path in shown and setting.description in shown
+
+
+def test_config_resolves_a_file_and_what_overrides_it(tmp_path, capsys):
+    (tmp_path / "robot.yaml").write_text("robot: car\nskill: {tau: 0.02, num_envs: 4}\n")
+    assert cli.main(["config", "--config", str(tmp_path / "robot.yaml"), "skill.tau=0.03"]) == 0
+    (tmp_path / "resolved.yaml").write_text(capsys.readouterr().out)
+    resolved = load_config(tmp_path / "resolved.yaml")
+    assert resolved == load_config(tmp_path / "robot.yaml", ["skill.tau=0.03"])
+    assert (resolved.robot, resolved.skill.tau, resolved.skill.num_envs) == ("car", 0.03, 4)
+
+
+@pytest.mark.train
+def test_training_leaves_a_complete_run(trained_run):
+    config = load_config(trained_run / "config.yaml")
+    assert config == tiny_run.config(trained_run)
+    lines = [json.loads(line) for line in (trained_run / "metrics.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["step"]) for line in lines] == [
+        ("planner", 1), ("planner", 2), ("skill", 256), ("skill", 512), ("evaluation", 512), ("skill", 768),
+        ("evaluation", 768),
+    ]  # fmt: skip
+    summary = json.loads((trained_run / "summary.json").read_text())
+    assert summary["planner"]["walk_reach_rate"] >= 0.0 and summary["skill"]["reach_rate"] >= 0.0
+    assert {"planner/checkpoint.pt", "skill/checkpoint.pt"} <= contents(trained_run).keys()
+    assert not list(trained_run.rglob("*.part")) and not (trained_run / "skill" / "replay").exists()
+
+
+@pytest.mark.train
+def test_going_on_with_a_finished_run_changes_nothing(trained_run, tmp_path, capsys):
+    run = Path(shutil.copytree(trained_run, tmp_path / "run"))
+    before = contents(run)
+    assert cli.main(["train", "--resume", str(run)]) == 0
+    after = contents(run)
+    assert {name for name in after if after[name] != before.get(name)} <= {"summary.json"}  # how long it took
+    assert before.keys() == after.keys()
+    assert f"hiernav export --run {run} --onnx BUNDLE" in capsys.readouterr().out
+
+
+@pytest.mark.train
+def test_a_run_and_its_bundle_are_evaluated(able_run, able_bundle, tmp_path, capsys):
+    world = ["--world", tiny_run.WORLD, "--episodes", "5", "--seed", "4"]
+    assert cli.main(["evaluate", "--run", str(able_run), *world, "--json", "-"]) == 0
+    from_run = json.loads(capsys.readouterr().out)
+    file = tmp_path / "deep" / "results.json"
+    two = [*world, "--world", "two-room(1.5,1.5)", "--protocol", "paper", "--robot", "point"]
+    assert cli.main(["evaluate", "--bundle", str(able_bundle), *two, "--json", str(file)]) == 0
+    assert tiny_run.WORLD in capsys.readouterr().out.replace("\n", "")
+    from_bundle = json.loads(file.read_text())
+    assert list(from_run) == [tiny_run.WORLD] and list(from_bundle) == [tiny_run.WORLD, "two-room(1.5,1.5)"]
+    ours, theirs = from_run[tiny_run.WORLD], from_bundle[tiny_run.WORLD]
+    assert (ours["reach_rate"], ours["steps_mean"]) == (theirs["reach_rate"], theirs["steps_mean"])
+    assert (ours["protocol"], theirs["protocol"]) == ("strict", "paper")
+    assert ours["reach_ci95"] == list(wilson_interval(round(5 * ours["reach_rate"]), 5))
+    wanted = {
+        "reach_rate", "reach_ci95", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean", "episodes",
+        "replans",
+    }  # fmt: skip
+    assert all(row.keys() >= wanted for row in from_bundle.values())
+    assert not list(file.parent.glob("*.part"))
+
+
+@pytest.mark.train
+def test_without_torch_bundles_are_evaluated_and_training_says_what_to_install(able_bundle, tmp_path):
+    code = f"""
+import sys
+for name in ("torch", "torchrl", "tensordict"):
+    sys.modules[name] = None
+from hiernav.cli import main
+assert main(["evaluate", "--bundle", {str(able_bundle)!r}, "--world", {tiny_run.WORLD!r}, "--episodes", "2"]) == 0
+print("-" * 9, file=sys.stderr)
+sys.exit(main(["train", "run_dir=run"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    line = done.stderr.partition("-" * 9 + "\n")[2]
+    assert line == "hiernav train: needs torch: install it with `pip install 'hiernav[train]'`\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.train
+def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, capsys):
+    settings = ("skill.total_steps=1920", "skill.checkpoint_every_steps=128", "skill.eval_every_steps=1920")
+    run = tmp_path / "run"
+    train = start("train", "--stage", "skill", *tiny_run.arguments(run, *settings))
+    await_file(run / "skill" / "checkpoint.pt", train)
+    train.send_signal(signal.SIGINT)
+    _, errors = train.communicate(timeout=60)
+    assert train.returncode == 130, errors
+    assert errors.rstrip().splitlines()[-1] == (
+        f"stopped; go on from the last checkpoint with: hiernav train --resume {run}"
+    )
+    assert "Traceback" not in errors
+    assert cli.main(["train", "--stage", "skill", "--resume", str(run)]) == 0
+    assert f"run folder: {run}" in capsys.readouterr().out
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if line["stage"] == "skill"] == list(range(128, 1921, 128))
+    assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [1920]
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command: Sequence[str] = (sys.executable, "-m", "hiernav.cli", *arguments)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def await_file(file: Path, process: subprocess.Popen[str], timeout: float = 120.0) -> None:
+    end = time.monotonic() + timeout
+    while not file.exists():
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"{file.name} never came: {process.communicate()}")
+        time.sleep(0.01)
