@@ -68,7 +68,7 @@ class Drive:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_args(_join_goal(sys.argv[1:] if argv is None else argv))
     try:
         return _run(arguments)
     except BundleError as error:
@@ -77,6 +77,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"run_loop: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _join_goal(argv: Sequence[str]) -> list[str]:
+    """Have `--goal -1,2` mean `--goal=-1,2`: argparse would take -1,2 for an option."""
+    joined = list(argv)
+    if "--goal" in joined[:-1]:
+        at = joined.index("--goal")
+        joined[at : at + 2] = [f"--goal={joined[at + 1]}"]
+    return joined
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny_run
+from without_torch import BLOCK
 
 from hiernav import cli
 from hiernav.config import describe_config, load_config
@@ -322,9 +323,7 @@ def test_a_run_and_its_bundle_are_evaluated(able_run, able_bundle, tmp_path, cap
 @pytest.mark.train
 def test_without_torch_bundles_are_evaluated_and_training_says_what_to_install(able_bundle, tmp_path):
     code = f"""
-import sys
-for name in ("torch", "torchrl", "tensordict"):
-    sys.modules[name] = None
+{BLOCK}
 from hiernav.cli import main
 assert main(["evaluate", "--bundle", {str(able_bundle)!r}, "--world", {tiny_run.WORLD!r}, "--episodes", "2"]) == 0
 print("-" * 9, file=sys.stderr)

@@ -1,0 +1,224 @@
+"""Claims about deploy/run_loop.py: it drives without torch, repeats itself, refuses what does not fit, and stops."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_run
+from without_torch import BLOCK
+
+from hiernav.sim.layout import parse_world
+from hiernav.sim.worlds import sample_layout
+
+SCRIPT = Path(__file__).parents[1] / "deploy" / "run_loop.py"
+RUN_SCRIPT = """
+import runpy
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+pytestmark = pytest.mark.train  # the bundles that are driven here are made with torch
+
+
+def command(*arguments: object) -> Sequence[str]:
+    """Command line of a process in which importing torch fails."""
+    return [sys.executable, "-c", BLOCK + RUN_SCRIPT, str(SCRIPT), *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def drives(able_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, str]]:
+    """The same two episodes driven twice, each time in a process of its own; folder and screen of each."""
+    done = []
+    for name in ("first", "second"):
+        out = tmp_path_factory.mktemp("drives") / name
+        ended = subprocess.run(
+            command("--fast", "--bundle", able_bundle, "--world", tiny_run.WORLD, "--episodes", 2, "--seed", 5,
+                    "--out", out, "--json", out.with_suffix(".json")),
+            capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert ended.returncode == 0, ended.stderr
+        done.append((out, ended.stdout))
+    return done
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("run_loop", SCRIPT)
+    module = importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+    spec.loader.exec_module(module)  # type: ignore[union-attr]
+    return module
+
+
+@pytest.fixture
+def refused(script: ModuleType, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Runs a command line that must be refused with `code`; returns its one line on stderr."""
+
+    def run(code: int, *arguments: object) -> str:
+        out = tmp_path / "out"
+        assert script.main([*map(str, arguments), "--fast", "--out", str(out)]) == code
+        line = capsys.readouterr().err
+        assert line.startswith("run_loop: ") and line.count("\n") == 1, line
+        assert not out.exists()
+        return line
+
+    return run
+
+
+def summary_of(drive: tuple[Path, str]) -> dict[str, Any]:
+    return json.loads((drive[0] / "summary.json").read_text())
+
+
+def test_a_robot_without_torch_drives_to_its_goals(drives):
+    summary = summary_of(drives[0])
+    assert [episode["seed"] for episode in summary["episodes"]] == [5, 6]
+    for episode in summary["episodes"]:
+        assert episode["reached"] and episode["reason"] == "goal"
+        assert 5 < episode["steps"] < 180 and episode["collisions"] >= 0
+        assert episode["stopped"] and episode["fault"] is None
+        assert episode["true_distance"] < 0.6  # reached by the estimate, and braked from full speed
+        assert episode["seconds"] == pytest.approx(0.02 * episode["steps"], abs=0.05)
+    assert summary["replans"] == {
+        reason: sum(episode["replans"].get(reason, 0) for episode in summary["episodes"])
+        for reason in summary["replans"]
+    }
+    assert summary["replans"]["start"] == 2
+
+
+def test_the_summary_accounts_for_every_tick(drives):
+    summary = summary_of(drives[0])
+    timing = summary["timing"]
+    assert timing["period"] == pytest.approx(0.02)
+    assert timing["ticks"] >= sum(episode["steps"] for episode in summary["episodes"])
+    assert timing["rate"] > 0 and timing["overruns"] >= 0
+    for part in ("lateness", "tick"):
+        assert 0.0 <= timing[part]["p50"] <= timing[part]["p99"] <= timing[part]["max"]
+    assert timing["tick"]["max"] > 0.0
+    assert timing["tick"]["count"] == timing["ticks"]
+    assert set(timing["sections"]) == {"read", "estimate", "plan", "infer", "guard", "send"}
+    assert timing["sections"]["plan"]["count"] == sum(summary["replans"].values())
+    assert summary["realtime"] == {}
+
+
+def test_pictures_and_json_are_left_in_the_folder(drives):
+    out, screen = drives[0]
+    assert {file.name for file in out.iterdir()} == {"summary.json", "drive-5.png", "drive-6.png"}
+    for file in out.glob("*.png"):
+        assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size > 10_000
+    assert out.with_suffix(".json").read_text() == (out / "summary.json").read_text()
+    assert "2 of 2 goals reached" in screen and "run folder: " in screen
+
+
+def test_the_same_seed_gives_the_same_drive(drives):
+    first, second = map(summary_of, drives)
+    assert first["episodes"] == second["episodes"] and first["replans"] == second["replans"]
+    assert (drives[0][0] / "drive-5.png").read_bytes() == (drives[1][0] / "drive-5.png").read_bytes()
+
+
+def test_a_goal_of_ones_own_is_driven_to(script, able_bundle, tmp_path, capsys):
+    layout = sample_layout(parse_world("pillar(1.2,1.2,0)"), 3)
+    goal = -0.8 * np.sign(layout.start[:2])
+    arguments = ["--fast", "--bundle", str(able_bundle), "--world", "pillar(1.2,1.2,0)", "--seed", "3", "--no-pictures"]
+    assert (
+        script.main([*arguments, "--goal", f"{goal[0]:g},{goal[1]:g}", "--exact", "--out", str(tmp_path / "out")]) == 0
+    )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["episodes"][0]["reached"] and summary["episodes"][0]["true_distance"] < 0.6
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["summary.json"]
+    assert "goal after" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("goal", ["1", "a,b", "1,2,3", "nan,0", "inf,0", "", "-1;2"])
+def test_a_malformed_goal_is_refused(refused, able_bundle, goal):
+    line = refused(2, "--bundle", able_bundle, "--goal", goal)
+    assert f"--goal {goal!r}: expected X,Y in metres, for example --goal 1.2,-0.5" in line
+
+
+def test_a_goal_outside_the_field_is_refused_with_its_extent(refused, able_bundle):
+    line = refused(2, "--bundle", able_bundle, "--world", "pillar(2,1.5,2)", "--goal", "-2.5,0")
+    assert "--goal -2.5,0 lies outside the field: x from -2 to 2, y from -1.5 to 1.5 m" in line
+
+
+def test_a_goal_inside_an_obstacle_is_refused_with_where_to_look(refused, able_bundle):
+    x, y = sample_layout(parse_world("pillar(2,2,10)"), 4).pillars[0]
+    line = refused(2, "--bundle", able_bundle, "--seed", 4, "--goal", f"{x:.3f},{y:.3f}")
+    assert (
+        "is less than 0.1 m from an obstacle in seed 4: choose a free place (hiernav world --png draws the world)"
+        in line
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--robot", "ant"], "unknown robot 'ant'; accepted: point, car, doggo"),
+        (["--world", "maze"], "world 'maze': unknown; accepted are pillar(W,H,N)"),
+        (["--world", "hall.yaml"], "the map file cannot be read"),
+        (["--world", "pillar(1,1,300)"], "use fewer obstacles or a larger field"),
+        (["--episodes", "0"], "--episodes is 0, it must be at least 1"),
+        (["--seed", "-1"], "seed -1, it must not be negative"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused(refused, able_bundle, arguments, part):
+    assert part in refused(2, "--bundle", able_bundle, *arguments)
+
+
+@pytest.mark.parametrize("name", ["planner.onnx", "skill.onnx", "golden.npz"])
+def test_an_altered_bundle_is_never_driven(refused, able_bundle, tmp_path, name):
+    bundle = Path(shutil.copytree(able_bundle, tmp_path / "bundle"))
+    data = bytearray((bundle / name).read_bytes())
+    data[-1] ^= 255
+    (bundle / name).write_bytes(data)
+    assert f"bundle refused: {name}: SHA-256 differs from the manifest" in refused(3, "--bundle", bundle)
+
+
+def test_a_bundle_that_does_not_fit_is_refused(refused, able_bundle, doggo_bundle, tmp_path):
+    assert "robot: the bundle is for 'doggo', this is 'point'" in refused(3, "--bundle", doggo_bundle)
+    assert "robot: the bundle is for 'point', this is 'doggo'" in refused(
+        3, "--bundle", able_bundle, "--robot", "doggo"
+    )
+    assert "no such folder" in refused(3, "--bundle", tmp_path / "absent")
+    bundle = Path(shutil.copytree(able_bundle, tmp_path / "bundle"))
+    manifest = json.loads((bundle / "manifest.json").read_text())
+    (bundle / "manifest.json").write_text(json.dumps(manifest | {"format_version": 2}))
+    assert "made by a newer hiernav" in refused(3, "--bundle", bundle)
+    manifest["observation"][0]["unit"] = "g"
+    (bundle / "manifest.json").write_text(json.dumps(manifest))
+    assert "observation[0] 'accelerometer': unit is 'g' in the bundle" in refused(3, "--bundle", bundle)
+
+
+def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
+    """Sent once the first of three drives has ended, while the second one is on its way."""
+    field = parse_world("pillar(4,4,0)")
+    away = [float(np.linalg.norm(x.start[:2] - x.goal)) for x in (sample_layout(field, seed) for seed in range(200))]
+    seed = next(k for k in range(199) if away[k] < 1.2 and away[k + 1] > 5.0)
+    process = subprocess.Popen(
+        command("--realtime", "--bundle", able_bundle, "--world", field, "--seed", seed, "--episodes", 3,
+                "--out", tmp_path),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    try:
+        first = process.stdout.readline()  # type: ignore[union-attr]
+        assert first.startswith(f"seed {seed}: "), process.communicate()[1]
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.5)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    episodes = json.loads((tmp_path / "summary.json").read_text())["episodes"]
+    assert [episode["reason"] for episode in episodes][1:] == ["interrupted"]
+    assert episodes[1]["stopped"] and not episodes[1]["reached"] and episodes[1]["fault"] is None
+    assert {file.name for file in tmp_path.iterdir()} == {"summary.json", f"drive-{seed}.png", f"drive-{seed + 1}.png"}
