@@ -92,17 +92,21 @@ def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, s
     return nearest_vertex(motion, vertices)[1].max(axis=1)
 
 
-def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Arc length of the foot of each point on its polyline, less the distance to that foot.
+def signed_progress(points: np.ndarray, line: np.ndarray, lookahead: float = 0.5) -> np.ndarray:
+    """How far along its polyline each point is, as the plan itself can vouch for.
 
-    It is 0 at the start and negative behind it, so backing away from a fresh plan costs what coming forward again pays.
-    The value is a function of position alone: over any closed motion its changes sum to zero. It is also at most what
-    the way to the goal has become shorter if the line is a shortest path (triangle inequality), so not even a motion
-    that provokes new plans on its way can earn more than it came nearer to the goal.
+    The largest of `arc length of p - distance to p` over the foot p of the point on the line and the vertices up to
+    `lookahead` beyond it. On a straight line that is the arc length; behind the start it is negative, so backing away from a
+    fresh plan costs what coming forward again pays; a step aside costs little more than the detour it is.
+
+    The value is a function of position alone: over any closed motion its changes sum to zero. If the line is a shortest
+    path it is also at most what the way to the goal has become shorter (triangle inequality), so not even a motion that
+    provokes new plans on its way earns more than it came nearer to the goal.
 
     Args:
         points: (N, 2) [m].
         line: (N, V, 2) polyline [m].
+        lookahead: short enough that a straight line to a vertex within it is as good as free [m].
 
     Returns:
         (N,) [m], at most the length of the line.
@@ -113,8 +117,11 @@ def signed_progress(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     t = np.clip(t, 0.0, 1.0)
     apart = np.square(points[:, None, :] - begin - t[..., None] * edge).sum(-1)
     rows, nearest = np.arange(len(line)), apart.argmin(-1)
-    along = arc_lengths(line)[rows, nearest] + t[rows, nearest] * np.sqrt(squared[rows, nearest])
-    return along - np.sqrt(apart[rows, nearest])
+    arc = arc_lengths(line)
+    foot = arc[rows, nearest] + t[rows, nearest] * np.sqrt(squared[rows, nearest])
+    ahead = arc - np.linalg.norm(points[:, None, :] - line, axis=-1)
+    ahead[arc > foot[:, None] + lookahead] = -np.inf
+    return np.maximum(foot - np.sqrt(apart[rows, nearest]), ahead.max(axis=1))
 
 
 def _longest(lengths: np.ndarray) -> float:

@@ -160,13 +160,23 @@ def progress_of(points: object, line: np.ndarray) -> np.ndarray:
     return signed_progress(points, np.repeat(line, len(points), axis=0))
 
 
-def test_progress_is_the_arc_length_of_the_foot_less_the_distance_to_it() -> None:
-    points = [[0.0, 0.0], [0.25, 0.04], [0.3, 0.0], [0.35, 0.2], [0.3, 0.4], [0.3, 0.9]]
-    assert_allclose(progress_of(points, CORNER), [0.0, 0.21, 0.3, 0.45, 0.7, 0.2], atol=1e-12)
+def test_on_a_straight_plan_progress_is_the_arc_length_and_a_step_aside_costs_its_detour() -> None:
+    points = [[0.0, 0.0], [0.25, 0.0], [1.0, 0.0], [0.0, 0.1]]
+    # the vertex half a metre on is the one that counts
+    detour = 0.5 - np.hypot(0.5, 0.1)
+    assert_allclose(progress_of(points, STRAIGHT), [0.0, 0.25, 1.0, detour], atol=1e-12)
+    assert detour > -0.01
+
+
+def test_progress_looks_no_farther_ahead_than_half_a_metre() -> None:
+    """A plan that comes back close to itself, around something, must not be cut short."""
+    hairpin = np.array([[[0.0, 0.0], [0.7, 0.0], [0.7, 0.3], [0.0, 0.3]]])
+    assert_allclose(progress_of([[0.0, 0.0], [0.1, 0.1]], hairpin), [0.0, 0.0], atol=1e-12)
 
 
 def test_backing_off_a_fresh_plan_is_negative_without_end() -> None:
-    assert_allclose(progress_of([[-0.1, 0.0], [-0.3, 0.4], [-7.0, 0.0]], STRAIGHT), [-0.1, -0.5, -7.0])
+    assert_allclose(progress_of([[-0.1, 0.0], [-7.0, 0.0]], STRAIGHT), [-0.1, -7.0], atol=1e-12)
+    assert progress_of([[-0.3, 0.4]], STRAIGHT)[0] == pytest.approx(0.5 - np.hypot(0.8, 0.4))
 
 
 def test_on_a_plan_without_extent_progress_is_coming_nearer() -> None:
