@@ -94,11 +94,14 @@ def test_backing_off_a_fresh_plan_is_free_in_the_paper_and_costs_by_default() ->
 
 
 def test_straying_sideways_costs_by_default_what_coming_back_pays() -> None:
-    assert terms_of((0.3, 0.0), (0.3, 0.2))["progress"] == pytest.approx(-2.0)
-    assert terms_of((0.3, 0.2), (0.3, 0.0))["progress"] == pytest.approx(2.0)
+    detour = 10 * (np.hypot(0.5, 0.2) - 0.5)
+    assert terms_of((0.3, 0.0), (0.3, 0.2))["progress"] == pytest.approx(-detour)
+    assert terms_of((0.3, 0.2), (0.3, 0.0))["progress"] == pytest.approx(detour)
 
 
-@pytest.mark.parametrize(("event", "term"), [("collided", "collision"), ("reached", "goal"), ("left", "leave_field")])
+@pytest.mark.parametrize(
+    ("event", "term"), [("collided", "collision"), ("reached", "goal"), ("left", "leave_field"), ("fallen", "fall")]
+)
 def test_an_event_is_one_in_its_own_term_alone(event: str, term: str) -> None:
     terms, without = terms_of((0.1, 0.0), (0.2, 0.0), **{event: True}), terms_of((0.1, 0.0), (0.2, 0.0))
     assert terms == {**without, term: 1.0}
