@@ -71,6 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(_join_goal(sys.argv[1:] if argv is None else argv))
     try:
         return _run(arguments)
+    except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
+        print("run_loop: interrupted", file=sys.stderr)
+        return OK
     except BundleError as error:
         print(f"run_loop: bundle refused: {error}", file=sys.stderr)
         return BAD_BUNDLE
@@ -148,7 +151,7 @@ def _run(arguments: argparse.Namespace) -> int:
             f"({result.seconds:.1f} s), {truth.collisions} collisions",
             highlight=False,
         )
-        if result.reason == "interrupted":
+        if driver.interrupted:
             break
     robot.close()
 

@@ -1,6 +1,6 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
-Exit codes: 0 done; 2 bad input, with one line that says what to do; 130 interrupted.
+Exit codes: 0 done; 1 training diverged; 2 bad input, with one line that says what to do; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hiernav.run import TrainingDiverged
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
     from hiernav.config import TrainConfig
 
-BAD_INPUT, INTERRUPTED = 2, 130
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,6 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
+    except TrainingDiverged as error:
+        print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
+        return FAILED
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("hiernav"):
             raise
@@ -288,6 +293,8 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
             f"{row['spl_mean']:.3f}",
         )
     console = Console()
+    if not console.is_terminal:
+        console.width = 120
     console.print(table)
     for name, row in results.items():
         replans = ", ".join(f"{reason} {count}" for reason, count in row["replans"].items())

@@ -182,6 +182,7 @@ def _from_bundle(path: Path) -> Policies:
             d_update_m=manifest.replan.d_update_m,
             half_fraction=manifest.replan.half_fraction,
             invalid=manifest.replan.invalid,
+            period=manifest.replan.period,
             waypoints=manifest.plan.waypoints,
             spacing_m=manifest.plan.spacing_m,
         ),

@@ -130,7 +130,12 @@ def write_bundle(
                 planning_radius_m=planner.planning_radius_m or robot.radius,
                 soft_margin_m=planner.soft_margin_m,
             ),
-            replan=ReplanSpec(d_update_m=option.d_update_m, half_fraction=option.half_fraction, invalid=option.invalid),
+            replan=ReplanSpec(
+                d_update_m=option.d_update_m,
+                half_fraction=option.half_fraction,
+                invalid=option.invalid,
+                period=option.period,
+            ),
             provenance=provenance,
         ),
     )

@@ -13,6 +13,7 @@ resumed run leaves the same files as an uninterrupted one.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -24,6 +25,10 @@ from hiernav.config import TrainConfig, dump_config, load_config
 
 class RunError(ValueError):
     """A run folder that cannot be used."""
+
+
+class TrainingDiverged(RuntimeError):
+    """Losses are no longer finite; the last checkpoint is from before."""
 
 
 class Run:
@@ -62,15 +67,16 @@ class Run:
         return cls(path, load_config(path / "config.yaml"))
 
     def log(self, stage: str, step: int, values: Mapping[str, float]) -> None:
-        """Append values to `metrics.jsonl` and to the curves."""
+        """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves."""
         with self._metrics.open("a") as file:
-            file.write(json.dumps({"stage": stage, "step": step, **values}) + "\n")
+            known = {key: value if math.isfinite(value) else None for key, value in values.items()}
+            file.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
         if self._writer is None:
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(self.path / "tensorboard"))
         for key, value in values.items():
-            if isinstance(value, int | float):
+            if math.isfinite(value):
                 self._writer.add_scalar(f"{stage}/{key}", value, step)
 
     def save(self, stage: str, state: Mapping[str, Any]) -> None:

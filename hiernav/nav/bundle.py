@@ -101,6 +101,7 @@ class ReplanSpec(_Struct, frozen=True):
     d_update_m: Positive
     half_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
     invalid: bool
+    period: Count | None = None
 
 
 class GuardSpec(_Struct, frozen=True):

@@ -135,8 +135,8 @@ class OptionStep:
 class WaypointOption:
     """Plans of N robots: when each one ends, a new one is asked for.
 
-    A row whose planner finds nothing (NaN) or nonsense, or whose position is not finite, keeps the plan it has, or holds its
-    position if it has none, and asks again at the next step; such refusals are counted.
+    A row whose planner finds nothing (NaN) or nonsense, or whose position is not finite, keeps the plan it has, or
+    holds its position if it has none, and asks again at the next step; such refusals are counted.
     """
 
     planner: Planner
@@ -148,7 +148,7 @@ class WaypointOption:
     sweep_radius: float = 0.1
     """Radius with which the remaining plan is swept for `invalid` [m]."""
     max_reach: float = 10.0
-    """A plan with a waypoint farther than this from the robot, in x or y, is refused [m]."""
+    """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
     def __post_init__(self) -> None:
         shape = (self.num_rows, self.num_waypoints, 2)

@@ -96,8 +96,8 @@ def signed_progress(points: np.ndarray, line: np.ndarray, lookahead: float = 0.5
     """How far along its polyline each point is, as the plan itself can vouch for.
 
     The largest of `arc length of p - distance to p` over the foot p of the point on the line and the vertices up to
-    `lookahead` beyond it. On a straight line that is the arc length; behind the start it is negative, so backing away from a
-    fresh plan costs what coming forward again pays; a step aside costs little more than the detour it is.
+    `lookahead` beyond it. On a straight line that is the arc length; behind the start it is negative, so backing away
+    from a fresh plan costs what coming forward again pays; a step aside costs little more than the detour it is.
 
     The value is a function of position alone: over any closed motion its changes sum to zero. If the line is a shortest
     path it is also at most what the way to the goal has become shorter (triangle inequality), so not even a motion that

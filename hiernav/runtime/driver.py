@@ -153,6 +153,8 @@ class Driver:
         self.supervisor = Supervisor()
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
         self.observers = list(observers)
+        self.interrupted = False
+        """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -182,7 +184,8 @@ class Driver:
         _warm_up(self.estimator.config)
         guard_before, estimator_before = self.guard.counts.copy(), self.estimator.counts.copy()
 
-        if self.loop.run() is LoopExit.INTERRUPTED:
+        self.interrupted = self.loop.run() is LoopExit.INTERRUPTED
+        if self.interrupted:
             self._reason = "interrupted"
         reason = self._reason or "interrupted"
         stopped = self._stop()
@@ -304,7 +307,8 @@ class Driver:
             return False
 
         try:
-            FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake).run()
+            loop = FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake)
+            self.interrupted |= loop.run() is LoopExit.INTERRUPTED
         except Exception:
             log.exception("the stop could not be verified")
             return False

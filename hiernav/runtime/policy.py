@@ -136,7 +136,7 @@ def make_agent(bundle: Bundle, robot_radius: float, goal_radius: float = 0.3) ->
     option = WaypointOption(
         VerifiedPlanner(proposer, expert, robot_radius),
         num_rows=1,
-        rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid),
+        rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
         num_waypoints=plan.waypoints,
         goal_radius=goal_radius,
         sweep_radius=robot_radius,

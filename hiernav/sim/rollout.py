@@ -75,6 +75,8 @@ def run_episodes(
     driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))
     collisions = np.zeros(task.num_rows, dtype=np.int64)
     while (current >= 0).any():
+        idle = current < 0
+        task.goal[idle] = task.pose[idle, :2]  # where it is: a robot at its goal asks for no plans
         before = task.pose[:, :2]
         step = task.step(skill(task.observation))
         driven += np.linalg.norm(task.pose[:, :2] - before, axis=-1)
@@ -108,7 +110,8 @@ def run_episodes(
         waiting += len(following)
         current[ended] = -1
         current[ended[: len(following)]] = following
-        task.reset(ended, [layouts[current[row]] if current[row] >= 0 else task.layouts[row] for row in ended])
+        again = ended[: len(following)]
+        task.reset(again, [layouts[index] for index in following.tolist()])
         for values in (driven, earned, planned, collisions):
             values[ended] = 0
     return [episode for episode in results if episode is not None]

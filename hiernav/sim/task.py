@@ -112,6 +112,8 @@ class NavigationTask:
             (N, D) float32 observations; rows that were not reset keep theirs.
         """
         rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
+        if not len(rows):
+            return self.observation
         drawn = [self._draw(int(row)) for row in rows] if layouts is None else list(layouts)
         self.sim.reset(rows, drawn)
         for row, layout in zip(rows, drawn, strict=True):

@@ -21,7 +21,7 @@ from hiernav.config import TrainConfig
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, TerminationReason
-from hiernav.run import Run, RunError
+from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.factory import RandomLayouts, make_task
 from hiernav.sim.layout import parse_world
 from hiernav.sim.reward import TERMS
@@ -39,10 +39,6 @@ _EVALUATION_SEED = 0xE7A1
 _BATCH_FRAMES = 128
 """Steps collected between two bursts of updates, at least one per simulation."""
 _LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
-
-
-class TrainingDiverged(RuntimeError):
-    """Losses are no longer finite; the last checkpoint is from before."""
 
 
 @dataclass
@@ -169,9 +165,8 @@ class SkillTrainer:
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
         skill, began, first = self.config.skill, time.perf_counter(), self.steps
-        number = self.steps // skill.checkpoint_every_steps
         self.task.draw_from(
-            RandomLayouts([parse_world(skill.world)], (self.config.seed, 2, number), self.task.robot.radius)
+            RandomLayouts([parse_world(skill.world)], (self.config.seed, 2, self.steps), self.task.robot.radius)
         )
         frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
         per_batch = skill.num_envs * max(1, min(_BATCH_FRAMES // skill.num_envs, frames // skill.num_envs))
