@@ -32,7 +32,7 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     preset: Annotated[Literal["default", "paper"], Meta(description="`paper`: the published network.")] = "default"
     samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 40_000
     samples_per_world: Annotated[int, Meta(ge=1, description="Starts labelled by one shortest-path field.")] = 100
-    epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 10
+    epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 6
     batch_size: Annotated[int, Meta(ge=1, description="Samples per update.")] = 256
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimiser.")] = 1e-3
     weight_decay: Annotated[float, Meta(ge=0, le=1, description="Decoupled weight decay of the optimiser.")] = 1e-4
@@ -124,6 +124,14 @@ class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     leave_field: Annotated[float, Meta(description="Once, on leaving the field.")] = -3.0
     fall: Annotated[float, Meta(description="Per control step on its back; see skill.end_on_fall.")] = -3.0
     goal_distance: Annotated[float, Meta(description="Per metre of distance to the goal, every step.")] = 0.0
+    lookahead_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=0.5,
+            description="How far ahead progress looks along the plan [m]: 0 holds a robot to its plan, more lets it explore.",
+        ),
+    ] = 0.5
     division_m: Annotated[
         float, Meta(gt=0, le=1, description="Spacing of the points that plan and motion are divided in [m].")
     ] = 0.1

@@ -38,10 +38,11 @@ def reward_terms(
         collided, reached, left, fallen: (N,) bool.
     """
     vertices = path.divide(line, config.division_m)
-    count = count_progress if config.preset == "paper" else signed_progress
     return {
         "path_distance": path.path_distance(before, after, vertices, config.division_m),
-        "progress": count(before, after, line, vertices, config.division_m),
+        "progress": count_progress(before, after, vertices)
+        if config.preset == "paper"
+        else signed_progress(before, after, line, config.lookahead_m) / config.division_m,
         "collision": collided.astype(np.float64),
         "goal": reached.astype(np.float64),
         "leave_field": left.astype(np.float64),
@@ -50,16 +51,12 @@ def reward_terms(
     }
 
 
-def count_progress(
-    before: np.ndarray, after: np.ndarray, line: np.ndarray, vertices: np.ndarray, spacing: float
-) -> np.ndarray:
-    """n_progress of the paper: NNI(x_t+1) - NNI(x_t) on the divided plan."""
+def count_progress(before: np.ndarray, after: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """n_progress of the paper (N,): NNI(x_t+1) - NNI(x_t) on the divided plan (N, V, 2)."""
     index, _ = path.nearest_vertex(np.stack([before, after], axis=1), vertices)
     return (index[:, 1] - index[:, 0]).astype(np.float64)
 
 
-def signed_progress(
-    before: np.ndarray, after: np.ndarray, line: np.ndarray, vertices: np.ndarray, spacing: float
-) -> np.ndarray:
-    """Progress along the plan in units of the spacing, less that away from it: closed motions earn nothing."""
-    return (path.signed_progress(after, line) - path.signed_progress(before, line)) / spacing
+def signed_progress(before: np.ndarray, after: np.ndarray, line: np.ndarray, lookahead: float) -> np.ndarray:
+    """Progress along the plan (N,) [m], signed before its first vertex: closed motions earn nothing."""
+    return path.signed_progress(after, line, lookahead) - path.signed_progress(before, line, lookahead)

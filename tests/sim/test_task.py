@@ -25,7 +25,12 @@ def test_standing_still_earns_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("to", "progress", "distance"),
-    [((-0.7, 1.5), 3.0, 0.0), ((-1.2, 1.5), -2.0, 0.2), ((-0.7, 1.3), 8 - 10 * np.hypot(0.5, 0.2), 0.2), ((-0.45, 1.5), 5.5, 0.05)],
+    [
+        ((-0.7, 1.5), 3.0, 0.0),
+        ((-1.2, 1.5), -2.0, 0.2),
+        ((-0.7, 1.3), 8 - 10 * np.hypot(0.5, 0.2), 0.2),
+        ((-0.45, 1.5), 5.5, 0.05),
+    ],
 )
 def test_a_motion_earns_its_progress_along_the_plan_less_the_detour_it_is(
     to: tuple[float, float], progress: float, distance: float
