@@ -129,7 +129,7 @@ class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Meta(
             ge=0,
             le=0.5,
-            description="How far ahead progress looks along the plan [m]: 0 holds a robot to its plan, more lets it explore.",
+            description="How far ahead progress looks [m]: 0 holds a robot to its plan, more lets it explore.",
         ),
     ] = 0.5
     division_m: Annotated[
