@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy import ndimage
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -141,12 +140,16 @@ class PathField:
     def _entries(self) -> np.ndarray:
         """For every cell the nearest one from which the goal can be reached, -1 if there is none."""
         if self._entry is None:
-            reachable = np.isfinite(self._cost).reshape(self._shape)
-            if not reachable.any():
-                self._entry = np.full(len(self._cost), -1)
-            else:
-                row, col = ndimage.distance_transform_edt(~reachable, return_distances=False, return_indices=True)
-                self._entry = (row * self._shape[1] + col).ravel()
+            self._entry = np.full(len(self._cost), -1)
+            reachable = np.flatnonzero(np.isfinite(self._cost))
+            if len(reachable):
+                far = np.isinf(self._cost).reshape(self._shape).astype(np.uint8)
+                _, label = cv2.distanceTransformWithLabels(
+                    far, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+                )
+                cell_of_label = np.zeros(int(label.max()) + 1, dtype=np.int64)
+                cell_of_label[label.flat[reachable]] = reachable
+                self._entry = cell_of_label[label.ravel()]
         return self._entry
 
 
