@@ -77,6 +77,10 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     tau: Annotated[float, Meta(gt=0, le=1, description="Rate at which target critics follow.")] = 0.005
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimisers.")] = 3e-4
     alpha_floor: Annotated[float, Meta(ge=0, description="The temperature does not fall below this.")] = 0.005
+    alpha_floor_end: Annotated[
+        Annotated[float, Meta(ge=0)] | None,
+        Meta(description="Value that the floor falls to over the second half of training; null: it stays."),
+    ] = None
     init_alpha: Annotated[float, Meta(gt=0, description="Temperature at the start.")] = 0.05
     target_entropy: Annotated[
         float | None, Meta(description="Entropy the temperature aims at [nat]; null: -actions.")

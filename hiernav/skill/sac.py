@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,6 +40,9 @@ class SacSettings:
 warnings.filterwarnings("ignore", "No target network updater", UserWarning)
 
 
+_LEAST_ALPHA = 1e-8
+
+
 class Learner:
     """Actor, twin critics, temperature and their optimiser.
 
@@ -62,7 +66,7 @@ class Learner:
             ValueOperator(critic, in_keys=["observation", "action"]),
             loss_function="l2",
             alpha_init=settings.init_alpha,
-            min_alpha=settings.alpha_floor or None,
+            min_alpha=max(settings.alpha_floor, _LEAST_ALPHA),
             target_entropy=-float(action_dim) if settings.target_entropy is None else settings.target_entropy,
             action_spec=Bounded(-1.0, 1.0, (action_dim,)),
         )
@@ -84,6 +88,10 @@ class Learner:
             torch._foreach_lerp_(self._target, self._online, self.settings.tau)
         self.updates += 1
         return {key: value.detach() for key, value in out.items()}
+
+    def set_alpha_floor(self, floor: float) -> None:
+        """Keep the temperature at or above `floor`; 0 lets it fall freely."""
+        self.loss.min_log_alpha.fill_(math.log(max(floor, _LEAST_ALPHA)))
 
     def state_dict(self) -> dict:
         """Everything a resumed run needs of the learner."""

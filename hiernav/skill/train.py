@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
-from hiernav.config import TrainConfig
+from hiernav.config import SkillConfig, TrainConfig
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, TerminationReason
@@ -89,6 +89,15 @@ def make_learner(config: TrainConfig) -> Learner:
         layer_norm=skill.layer_norm,
     )
     return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings)
+
+
+def alpha_floor(skill: SkillConfig, steps: int) -> float:
+    """Floor of the temperature after so many steps: falls geometrically over the second half of training."""
+    first, last = skill.alpha_floor, skill.alpha_floor_end
+    if last is None or first == 0.0:
+        return first
+    share = min(max(2.0 * steps / skill.total_steps - 1.0, 0.0), 1.0)
+    return first * (max(last, 1e-6) / first) ** share
 
 
 class TorchSkill:
@@ -211,6 +220,7 @@ class SkillTrainer:
         if self.steps <= skill.learning_starts or len(self.replay) < skill.batch_size:
             return {}
         self._due += frames * skill.updates_per_step
+        self.learner.set_alpha_floor(alpha_floor(skill, self.steps))
         metrics: dict[str, torch.Tensor] = {}
         while self._due >= 1.0:
             metrics = self.learner.update(self._batch())
