@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
+
+from hiernav.runtime.kalman import ExtendedKalmanFilter
 
 X, Y, YAW, VX, VY, BIAS = range(6)
 POSITION = slice(X, Y + 1)
