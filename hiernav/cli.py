@@ -99,8 +99,15 @@ def _parser() -> argparse.ArgumentParser:
         help="turn a run into a bundle of ONNX files",
         description="Export a run's planner and skill, with all they assume, to a verified bundle.",
     )
-    export.add_argument("--run", dest="run_path", metavar="RUN", required=True, help="a run folder")
-    export.add_argument("--onnx", metavar="DIR", required=True, help="bundle folder to write; replaced if it exists")
+    export.add_argument("--run", dest="run_path", metavar="RUN", help="a run folder (the newest one in runs/)")
+    export.add_argument(
+        "--onnx",
+        nargs="?",
+        const="",
+        metavar="DIR",
+        required=True,
+        help="write a bundle of ONNX files; DIR is replaced if it holds one (RUN/bundle)",
+    )
     export.set_defaults(run=_export)
 
     world = commands.add_parser(
@@ -148,7 +155,7 @@ def _train(arguments: argparse.Namespace) -> int:
         return INTERRUPTED
     finally:
         run.close()
-    print(f"done; export with: hiernav export --run {run.path} --onnx BUNDLE")
+    print(f"done; export with: hiernav export --run {run.path} --onnx")
     return 0
 
 
@@ -193,8 +200,10 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 def _export(arguments: argparse.Namespace) -> int:
     from hiernav.export import export_run
+    from hiernav.run import newest_run
 
-    out = export_run(arguments.run_path, arguments.onnx)
+    run = Path(arguments.run_path) if arguments.run_path else newest_run()
+    out = export_run(run, arguments.onnx or run / "bundle")
     total = sum(file.stat().st_size for file in out.iterdir())
     print(f"{out}: {', '.join(sorted(file.name for file in out.iterdir()))}; {total / 1e6:.2f} MB, checked")
     return 0

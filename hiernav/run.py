@@ -119,6 +119,18 @@ class Run:
             self._writer = None
 
 
+def newest_run(folder: str | Path = "runs") -> Path:
+    """The run in `folder` that was begun last.
+
+    Raises:
+        RunError: there is none.
+    """
+    runs = sorted(Path(folder).glob("*/config.yaml"), key=lambda file: file.stat().st_mtime_ns)
+    if not runs:
+        raise RunError(f"no run folder in {folder}/: name one with --run, or make one with `hiernav train`")
+    return runs[-1].parent
+
+
 def _read_checkpoint(file: Path) -> dict[str, Any]:
     import torch
 

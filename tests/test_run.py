@@ -11,7 +11,7 @@ import tiny_run
 
 from hiernav import run as run_module
 from hiernav.config import ConfigError, load_config
-from hiernav.run import Run, RunError, write_atomically
+from hiernav.run import Run, RunError, newest_run, write_atomically
 
 
 @pytest.fixture
@@ -161,3 +161,17 @@ def test_a_checkpoint_that_would_run_code_is_refused(run):
     torch.save({"steps": Path("/")}, run.path / "skill" / "checkpoint.pt")  # a pickled class of another library
     with pytest.raises(RunError, match="cannot be read"):
         run.load("skill")
+
+
+def test_the_newest_run_is_the_one_begun_last(tmp_path: Path) -> None:
+    for age, name in enumerate(("b", "a", "c")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").touch()
+        os.utime(tmp_path / name / "config.yaml", (100 - age, 100 - age))
+    (tmp_path / "no run").mkdir()
+    assert newest_run(tmp_path) == tmp_path / "b"
+
+
+def test_where_there_is_no_run_yet_the_error_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="hiernav train"):
+        newest_run(tmp_path)
