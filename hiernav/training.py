@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import torch
@@ -74,7 +75,8 @@ class _PlannerDisplay(_Display):
 
 class _SkillDisplay(_Display):
     def __call__(self, now: skill_train.Progress) -> None:
-        note = f"{now.steps_per_second:,.0f} steps/s  {now.updates:,} updates  reach {now.reach_rate:.3f}"
+        reach = "-" if math.isnan(now.reach_rate) else f"{now.reach_rate:.3f}"
+        note = f"{now.steps_per_second:,.0f} steps/s  {now.updates:,} updates  reach {reach}"
         if now.evaluation is not None:
             note += f"  evaluated {now.evaluation:.3f}"
         self.show("skill", now.steps, now.total_steps, note)
