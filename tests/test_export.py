@@ -108,8 +108,8 @@ class Doubled:
 
 @pytest.mark.parametrize("leader", ["torch", "onnx"])
 def test_whichever_drives_the_other_would_have_done_the_same(both, leader):
-    """Same inputs at every step: GOSELO images are made of grey levels, so that two poses a nanometre apart may differ
-    in one of them, and closed loops then drift apart by more than the networks do."""
+    """Same inputs at every step: an action comes back through the accelerometer, so that two closed loops drift apart
+    within a few steps, however little their networks differ."""
     leading, following = both if leader == "torch" else both[::-1]
     layout = sample_layout(parse_world("pillar(2,2,3)"), 12)
     planner = Doubled(make_planner(leading, "cnn"), make_planner(following, "cnn"))
