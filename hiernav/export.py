@@ -41,7 +41,7 @@ from hiernav.runtime.policy import check_golden
 from hiernav.sim.factory import make_task
 from hiernav.sim.robots import get_robot
 from hiernav.skill.networks import Actor
-from hiernav.skill.train import TorchSkill, load_actor, skill_layout
+from hiernav.skill.train import TorchSkill, load_actor, merit, skill_layout
 
 OPSET = 18
 GOLDEN_SAMPLES = 32
@@ -201,7 +201,7 @@ def _fields(layout: ObservationLayout) -> tuple[ObservationField, ...]:
 
 
 def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
-    best = max(states["skill"]["evaluations"], key=lambda e: e["reach_rate"])
+    best = max(states["skill"]["evaluations"], key=merit)
     return {
         "hiernav": __version__,
         "torch": torch.__version__.split("+")[0],

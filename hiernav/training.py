@@ -42,7 +42,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
             progress.console.print(f"skill: going on after step {steps:,} of {run.config.skill.total_steps:,}")
         began = time.perf_counter()
         skill.train(_SkillDisplay(progress))
-        best = max(skill.evaluations, key=lambda evaluation: evaluation["reach_rate"])
+        best = max(skill.evaluations, key=skill_train.merit)
         run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
 
 

@@ -222,3 +222,13 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
     assert [episode["reason"] for episode in episodes][1:] == ["interrupted"]
     assert episodes[1]["stopped"] and not episodes[1]["reached"] and episodes[1]["fault"] is None
     assert {file.name for file in tmp_path.iterdir()} == {"summary.json", f"drive-{seed}.png", f"drive-{seed + 1}.png"}
+
+
+def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path, monkeypatch):
+    monkeypatch.setattr(script, "TILT_LIMIT", 1e-3)
+    file = tmp_path / "out.json"
+    arguments = ["--fast", "--robot", "doggo", "--bundle", str(doggo_bundle), "--episodes", "2", "--no-pictures"]
+    assert script.main([*arguments, "--out", str(tmp_path / "run"), "--json", str(file)]) == script.FAULT
+    episodes = json.loads(file.read_text())["episodes"]
+    assert [episode["reason"] for episode in episodes] == ["fault", "fault"]
+    assert all("tilted" in episode["fault"] for episode in episodes)

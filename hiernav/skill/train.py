@@ -100,6 +100,11 @@ def alpha_floor(skill: SkillConfig, steps: int) -> float:
     return first * (max(last, 1e-6) / first) ** share
 
 
+def merit(evaluation: dict[str, float]) -> tuple[float, float]:
+    """What makes one evaluation better than another: reach rate less a hundredth per collision, then fewer steps."""
+    return evaluation["reach_rate"] - 0.01 * evaluation["collisions_mean"], -evaluation["steps_mean"]
+
+
 class TorchSkill:
     """The learner's deterministic policy as a `Skill`: observations (N, D) -> actions (N, A), numpy in and out."""
 
@@ -272,9 +277,6 @@ class SkillTrainer:
             "collisions_mean": float(np.mean([e.collisions for e in episodes])),
             "return_mean": float(np.mean([e.return_ for e in episodes])),
         }
-
-        def merit(evaluation: dict[str, float]) -> tuple[float, float]:
-            return evaluation["reach_rate"] - 0.01 * evaluation["collisions_mean"], -evaluation["steps_mean"]
 
         if all(merit(result) >= merit(earlier) for earlier in self.evaluations):
             self.best_actor = {key: value.clone() for key, value in self.learner.actor.state_dict().items()}
