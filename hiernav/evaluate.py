@@ -23,7 +23,7 @@ from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
 from hiernav.runtime.policy import load_policies
 from hiernav.sim.factory import expert_planner, make_task
-from hiernav.sim.layout import WorldSpec, parse_world
+from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes
 from hiernav.sim.worlds import sample_layout
@@ -208,8 +208,3 @@ def _from_run(path: Path) -> Policies:
         None if network is None else TorchNetwork(network),
         () if network is None else tuple(network.channels),
     )
-
-
-def parse_worlds(texts: Sequence[str]) -> list[WorldSpec]:
-    """World specifications of a list of names."""
-    return [parse_world(text) for text in texts]

@@ -45,7 +45,6 @@ from hiernav.skill.train import TorchSkill, load_actor, merit, skill_layout
 
 OPSET = 18
 GOLDEN_SAMPLES = 32
-PROVENANCE_FILE = "summary.json"
 
 
 class _MeanAction(nn.Module):

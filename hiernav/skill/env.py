@@ -14,8 +14,6 @@ from hiernav.nav.option import TerminationReason
 from hiernav.sim.reward import TERMS
 from hiernav.sim.task import NavigationTask
 
-INFO_KEYS = ("terms", "reason", "reached", "collided", "episode_steps")
-
 
 class NavigationEnv(EnvBase):
     """N robots following plans; batch size (N,).

@@ -12,9 +12,11 @@ from tensordict import TensorDict  # noqa: E402
 from torch import nn  # noqa: E402
 from torchrl.objectives import SACLoss  # noqa: E402
 
+from hiernav.config import load_config  # noqa: E402
 from hiernav.nav.observation import observation_layout  # noqa: E402
 from hiernav.skill.networks import Actor, Critic  # noqa: E402
 from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
+from hiernav.skill.train import alpha_floor, make_learner  # noqa: E402
 
 LAYOUT = observation_layout("point")
 SMALL = SacSettings(hidden=(16, 16))
@@ -257,3 +259,17 @@ def test_observations_are_scaled_inside_the_networks() -> None:
     clipped = torch.zeros(1, LAYOUT.size)
     clipped[0, column] = 10.0
     torch.testing.assert_close(actor.trunk(raw), actor.trunk.layers(clipped))
+
+
+def test_the_floor_of_the_temperature_falls_over_the_second_half_of_training() -> None:
+    overrides = ["skill.alpha_floor=0.02", "skill.alpha_floor_end=0.002", "skill.total_steps=10000"]
+    skill = load_config(overrides=overrides).skill
+    floors = [alpha_floor(skill, steps) for steps in (0, 5000, 7500, 10_000)]
+    assert floors == pytest.approx([0.02, 0.02, 0.02 * 10**-0.5, 0.002])
+    assert alpha_floor(load_config(overrides=overrides[:1]).skill, 10**6) == 0.02
+
+
+def test_the_temperature_is_lifted_to_its_floor() -> None:
+    learner = make_learner(load_config())
+    learner.set_alpha_floor(3.0)
+    assert float(learner.loss._alpha) == pytest.approx(3.0)
