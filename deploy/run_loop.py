@@ -180,7 +180,7 @@ def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
     """Load a bundle and refuse it unless it fits this robot."""
     bundle = load_bundle(path)
     bundle.require_robot(spec.name, file_sha256(spec.xml_path))
-    bundle.require_layout(observation_layout(spec.name))
+    bundle.require_layout(observation_layout(spec.name, clock="clock" in bundle.layout.names))
     return bundle
 
 

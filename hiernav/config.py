@@ -95,6 +95,11 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ] = None
     mirror: Annotated[bool, Meta(description="Reflect half of every batch left to right.")] = True
     end_on_fall: Annotated[bool, Meta(description="End a training episode when the robot has turned over.")] = True
+    clock: Annotated[bool, Meta(description="Show the skill a gait clock of 3 Hz.")] = False
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"],
+        Meta(description="Of products in hidden layers; auto: bfloat16 where the processor multiplies it natively."),
+    ] = "auto"
     layer_norm: Annotated[bool, Meta(description="Layer normalisation in the critics.")] = False
 
 

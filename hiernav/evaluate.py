@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from hiernav.config import OptionConfig, PlannerConfig, TrainConfig
+from hiernav.config import OptionConfig, PlannerConfig, SkillConfig, TrainConfig
 from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
 from hiernav.runtime.policy import load_policies
-from hiernav.sim.factory import expert_planner, make_task
+from hiernav.sim.factory import expert_planner, make_task, skill_layout
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes
@@ -171,8 +170,7 @@ def _from_bundle(path: Path) -> Policies:
     bundle = load_bundle(path)
     robot = get_robot(bundle.manifest.robot)
     bundle.require_robot(robot.name, file_sha256(robot.xml_path))
-    bundle.require_layout(observation_layout(robot.name))
-    manifest = bundle.manifest
+    manifest, terms = bundle.manifest, bundle.layout.names
     config = TrainConfig(
         robot=manifest.robot,  # type: ignore[arg-type]  # get_robot has checked it
         planner=PlannerConfig(
@@ -186,7 +184,9 @@ def _from_bundle(path: Path) -> Policies:
             waypoints=manifest.plan.waypoints,
             spacing_m=manifest.plan.spacing_m,
         ),
+        skill=SkillConfig(preset="default" if "waypoints" in terms else "baseline", clock="clock" in terms),
     )
+    bundle.require_layout(skill_layout(config))
     loaded = load_policies(bundle)
     return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels)
 

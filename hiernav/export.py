@@ -38,10 +38,10 @@ from hiernav.planner.network import HypothesisNetwork, PaperNetwork
 from hiernav.planner.train import load_network, torch_planner
 from hiernav.run import Run, RunError
 from hiernav.runtime.policy import check_golden
-from hiernav.sim.factory import make_task
+from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.robots import get_robot
 from hiernav.skill.networks import Actor
-from hiernav.skill.train import TorchSkill, load_actor, merit, skill_layout
+from hiernav.skill.train import TorchSkill, load_actor, merit
 
 OPSET = 18
 GOLDEN_SAMPLES = 32

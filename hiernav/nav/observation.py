@@ -74,6 +74,9 @@ _BASE = (
 )
 _WAYPOINTS = ObservationTerm("waypoints", 20, "m, body frame", 2.0)
 _GOAL = ObservationTerm("goal", 2, "m, body frame", 0.5)
+CLOCK_HZ = 3.0
+"""Frequency of the gait clock: about that of the fastest gaits of the quadruped under open-loop sinusoids."""
+_CLOCK = ObservationTerm("clock", 2, f"sine and cosine of {CLOCK_HZ:g} Hz", 1.0)
 _EXTRA: dict[str, tuple[ObservationTerm, ...]] = {
     "point": (),
     "car": (
@@ -88,15 +91,24 @@ _EXTRA: dict[str, tuple[ObservationTerm, ...]] = {
 }
 
 
-def observation_layout(robot: str, guidance: str = "waypoints") -> ObservationLayout:
+def observation_layout(robot: str, guidance: str = "waypoints", clock: bool = False) -> ObservationLayout:
     """The layout of a robot's skill.
 
     Args:
         robot: "point", "car" or "doggo".
         guidance: "waypoints" (path-conditioned) or "goal" (the paper's baseline).
+        clock: whether the skill sees a gait clock (beyond the paper). A gait is periodic: with the clock it is a
+            function of the observation, and no pose of the robot is one that its mean action holds for ever.
     """
     if robot not in _EXTRA:
         raise ValueError(f"unknown robot {robot!r}; known: {', '.join(_EXTRA)}")
     if guidance not in ("waypoints", "goal"):
         raise ValueError(f"unknown guidance {guidance!r}; known: waypoints, goal")
-    return ObservationLayout(_BASE + ((_WAYPOINTS if guidance == "waypoints" else _GOAL),) + _EXTRA[robot])
+    guide = _WAYPOINTS if guidance == "waypoints" else _GOAL
+    return ObservationLayout((*_BASE, guide, *_EXTRA[robot], *((_CLOCK,) if clock else ())))
+
+
+def clock_phase(time: np.ndarray) -> np.ndarray:
+    """The gait clock (N, 2) at times (N,) since the start of the episode [s]."""
+    angle = 2.0 * np.pi * CLOCK_HZ * np.asarray(time, dtype=np.float64)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1)

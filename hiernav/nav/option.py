@@ -16,7 +16,7 @@ import numpy as np
 
 from hiernav.nav import path
 from hiernav.nav.frames import world_to_body
-from hiernav.nav.observation import ObservationLayout
+from hiernav.nav.observation import ObservationLayout, clock_phase
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 
 Skill = Callable[[np.ndarray], np.ndarray]
@@ -311,10 +311,16 @@ class HierarchicalAgent:
     option: WaypointOption
     skill: Skill
     layout: ObservationLayout
+    control_period: float
+    """Time between two calls of `act` [s]."""
+
+    def __post_init__(self) -> None:
+        self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
         self.option.reset(rows)
+        self._steps[slice(None) if rows is None else rows] = 0
 
     def act(
         self,
@@ -332,13 +338,18 @@ class HierarchicalAgent:
             occupancy: N maps as they are now.
         """
         step = self.option.step(pose[:, :2], goal, occupancy)
-        observation = self.layout.build(guided(terms, pose, step.plan, goal))
+        observation = self.layout.build(guided(terms, pose, step.plan, goal, self._steps * self.control_period))
+        self._steps += 1
         return AgentStep(self.skill(observation), observation, step)
 
 
 def guided(
-    terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray
+    terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray, time: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Add what guides the skill to its sensors: waypoints and goal, re-expressed in the present body frame."""
+    """Add what guides the skill to its sensors: waypoints and goal in the present body frame, and the gait clock.
+
+    `time` (N,) is that since the start of each episode [s].
+    """
     guides = world_to_body(np.concatenate([plan, np.asarray(goal, dtype=np.float64)[:, None]], axis=1), pose)
-    return {**terms, "waypoints": guides[:, :-1].reshape(len(pose), -1), "goal": guides[:, -1]}
+    waypoints = guides[:, :-1].reshape(len(pose), -1)
+    return {**terms, "waypoints": waypoints, "goal": guides[:, -1], "clock": clock_phase(time)}

@@ -141,7 +141,7 @@ def make_agent(bundle: Bundle, robot_radius: float, goal_radius: float = 0.3) ->
         goal_radius=goal_radius,
         sweep_radius=robot_radius,
     )
-    return HierarchicalAgent(option, policies.skill, bundle.layout)
+    return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s)
 
 
 def check_golden(bundle: Bundle, policies: Policies | None = None) -> dict[str, float]:

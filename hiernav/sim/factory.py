@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hiernav.config import TrainConfig
-from hiernav.nav.observation import observation_layout
+from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, ReplanRule, WaypointOption
 from hiernav.nav.planners import ShortestPathPlanner
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
@@ -72,17 +72,22 @@ def make_task(
         goal_radius=GOAL_RADIUS,
         sweep_radius=robot.radius,
     )
-    guidance = "goal" if config.skill.preset == "baseline" else "waypoints"
     return NavigationTask(
         robot,
         worlds,
         layouts or RandomLayouts(worlds, (config.seed,), robot.radius),
         option,
-        observation_layout(config.robot, guidance),
+        skill_layout(config),
         config.reward,
         config.threads,
         end_on_fall,
     )
+
+
+def skill_layout(config: TrainConfig) -> ObservationLayout:
+    """Observation layout of a configuration's skill."""
+    guidance = "goal" if config.skill.preset == "baseline" else "waypoints"
+    return observation_layout(config.robot, guidance, config.skill.clock)
 
 
 def replan_rule(config: TrainConfig) -> ReplanRule:

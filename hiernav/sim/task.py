@@ -166,7 +166,9 @@ class NavigationTask:
         """Let the options of some rows end or go on, then observe."""
         pose = self.sim.pose[rows]
         option = self.option.step(pose[:, :2], self.goal[rows], [self._maps[row] for row in rows], rows)
-        values = guided({k: v[rows] for k, v in self.sim.sensors.items()}, pose, option.plan, self.goal[rows])
+        sensors = {name: values[rows] for name, values in self.sim.sensors.items()}
+        time = self.steps[rows] * self.robot.control_period
+        values = guided(sensors, pose, option.plan, self.goal[rows], time)
         values["lidar"] = lidar_closeness(pose, self._points[rows])
         observation = self.observation.copy()
         observation[rows] = np.nan_to_num(self.layout.build(values))  # a broken row is reported, not passed on

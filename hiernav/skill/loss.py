@@ -25,10 +25,15 @@ class DirectSACLoss(SACLoss):
     """SACLoss for `hiernav.skill.networks`: same values and gradients for the same noise.
 
     The temporal-difference target is that of TD(0): bootstrap through truncation, not through termination.
+
+    Args:
+        precision: of the products in hidden layers. Weights, heads, distributions and losses stay in float32.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, precision: torch.dtype = torch.float32, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self._reduced = precision != torch.float32
+        self._precision = precision
         actor = self.actor_network_params["module", "0", "module"]
         self._scales = [actor["trunk", "scale"]]  # a bare tensor would be registered as one more buffer
         self._actor = _layers(actor)
@@ -37,6 +42,10 @@ class DirectSACLoss(SACLoss):
         self._frozen = [(weight.detach(), bias.detach(), relu) for weight, bias, relu in self._critics]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.autocast("cpu", self._precision, enabled=self._reduced):
+            return self._losses(tensordict)
+
+    def _losses(self, tensordict: TensorDictBase) -> TensorDictBase:
         alpha, following = self._alpha, tensordict["next"]
         now = self._scaled(tensordict["observation"])
         with torch.no_grad():
@@ -74,10 +83,12 @@ def _layers(tree: TensorDictBase) -> list[Layer]:
 def _sample(layers: list[Layer], scaled: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Actions (B, A) of the tanh-Gaussian, reparameterised, and their log-probability (B, 1)."""
     hidden = scaled
-    for weight, bias, relu in layers:
+    for weight, bias, relu in layers[:-1]:
         hidden = functional.linear(hidden, weight, bias)
         hidden = hidden.relu() if relu else hidden
-    loc, raw = hidden.chunk(2, dim=-1)
+    weight, bias, _ = layers[-1]
+    with torch.autocast("cpu", enabled=False):
+        loc, raw = functional.linear(hidden.float(), weight, bias).chunk(2, dim=-1)
     low, high = LOG_STD_RANGE
     log_std = low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0)
     noise = torch.randn_like(loc)
@@ -91,10 +102,12 @@ def _sample(layers: list[Layer], scaled: torch.Tensor) -> tuple[torch.Tensor, to
 def _values(layers: list[Layer], scaled: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     """Values (2, B, 1) of both critics."""
     hidden = torch.cat([scaled, action], dim=-1).expand(2, -1, -1)
-    for weight, bias, relu in layers:
+    for weight, bias, relu in layers[:-1]:
         if weight.ndim == 3:
             hidden = torch.baddbmm(bias[:, None], hidden, weight.mT)
         else:
             hidden = functional.layer_norm(hidden, hidden.shape[-1:]) * weight[:, None] + bias[:, None]
         hidden = hidden.relu() if relu else hidden
-    return hidden
+    weight, bias, _ = layers[-1]
+    with torch.autocast("cpu", enabled=False):
+        return torch.baddbmm(bias[:, None], hidden.float(), weight.mT)

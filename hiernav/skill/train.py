@@ -19,10 +19,9 @@ from torchrl.collectors import Collector
 
 from hiernav.config import SkillConfig, TrainConfig
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.run import Run, RunError, TrainingDiverged
-from hiernav.sim.factory import RandomLayouts, make_task
+from hiernav.sim.factory import RandomLayouts, make_task, skill_layout
 from hiernav.sim.layout import parse_world
 from hiernav.sim.reward import TERMS
 from hiernav.sim.robots import get_robot
@@ -70,11 +69,6 @@ class _Episodes:
         return float(np.mean(self.reached)) if self.reached else float("nan")
 
 
-def skill_layout(config: TrainConfig) -> ObservationLayout:
-    """Observation layout of a configuration's skill."""
-    return observation_layout(config.robot, "goal" if config.skill.preset == "baseline" else "waypoints")
-
-
 def make_learner(config: TrainConfig) -> Learner:
     """An untrained learner for a configuration."""
     skill = config.skill
@@ -87,6 +81,7 @@ def make_learner(config: TrainConfig) -> Learner:
         alpha_floor=skill.alpha_floor,
         target_entropy=skill.target_entropy,
         layer_norm=skill.layer_norm,
+        precision=skill.precision,
     )
     return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings)
 

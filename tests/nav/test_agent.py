@@ -16,11 +16,14 @@ FREE = map_with_pillars()
 FAR = (2.5, 0.0)
 
 
+PERIOD = 0.1
+
+
 @pytest.mark.parametrize("guidance", ["waypoints", "goal"])
 def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guidance: str) -> None:
     layout = observation_layout("point", guidance)
     sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
-    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: np.tanh(o[:, :2]), layout)
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: np.tanh(o[:, :2]), layout, PERIOD)
     goal = np.array([[2.0, 0.0], [0.0, 2.0]])
     poses = [
         [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
@@ -40,9 +43,24 @@ def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guida
 def test_an_agent_that_is_reset_plans_again() -> None:
     layout = observation_layout("point")
     sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms}
-    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 1), lambda o: o[:, :2], layout)
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 1), lambda o: o[:, :2], layout, PERIOD)
     reasons = []
     for _ in range(2):
         reasons += [int(agent.act(np.zeros((1, 3)), sensors, np.array([FAR]), [FREE]).reason[0]) for _ in range(2)]
         agent.reset()
     assert reasons == [START, NONE, START, NONE]
+
+
+def test_the_gait_clock_starts_with_each_episode_and_runs_at_three_hertz() -> None:
+    layout = observation_layout("doggo", clock=True)
+    sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: o[:, :12], layout, PERIOD)
+
+    def seen() -> np.ndarray:
+        step = agent.act(np.zeros((2, 3)), sensors, np.array([FAR, FAR]), [FREE] * 2)
+        return np.arctan2(*step.observation[:, layout.slices["clock"]].T) / (2.0 * np.pi) % 1.0
+
+    phases = np.array([seen() for _ in range(6)])
+    assert_allclose(phases[:, 0], np.arange(6) * 3.0 * PERIOD % 1.0, atol=1e-6)
+    agent.reset(np.array([1]))
+    assert_allclose(seen(), [6 * 3.0 * PERIOD % 1.0, 0.0], atol=1e-6)

@@ -10,7 +10,7 @@ import pytest
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.observation import observation_layout
+from hiernav.nav.observation import clock_phase, observation_layout
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
@@ -29,7 +29,7 @@ def twin(layout, flip):
 @pytest.mark.parametrize("guidance", ["waypoints", "goal"])
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
 def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidance: str) -> None:
-    spec, layout = get_robot(robot), observation_layout(robot, guidance)
+    spec, layout = get_robot(robot), observation_layout(robot, guidance, clock=True)
     mirror = mirror_of(robot, layout)
     # a mirror in the world's x-z plane, or for the car in its y-z plane, turns yaw into -yaw
     flip = np.array([-1.0, 1.0]) if robot == "car" else np.array([1.0, -1.0])
@@ -49,6 +49,7 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
             "lidar": lidar_closeness(sim.pose, points),
             "waypoints": world_to_body(plans, sim.pose).reshape(2, -1),
             "goal": world_to_body(goals[:, None], sim.pose)[:, 0],
+            "clock": clock_phase(sim.time),
         }
         return layout.build(values)
 
