@@ -264,7 +264,7 @@ def _check_worlds(config: TrainConfig) -> None:
     planned = config.planner.planning_radius_m or body
     for key, texts, radius in (
         ("planner.worlds", config.planner.worlds, planned),
-        ("skill.world", (config.skill.world,), body),
+        ("skill.worlds", config.skill.worlds, body),
     ):
         for text in texts:
             try:

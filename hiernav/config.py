@@ -60,7 +60,9 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Literal["default", "paper", "baseline"],
         Meta(description="`baseline`: no waypoints, the goal instead. Also the preset of `option` and `reward`."),
     ] = "default"
-    world: Annotated[World, Meta(description="World to train in.")] = "pillar(2,2,10)"
+    worlds: Annotated[tuple[World, ...], Meta(min_length=1, description="Worlds to train in, in equal parts.")] = (
+        "pillar(2,2,10)",
+    )
     planner: Annotated[
         Literal["astar", "cnn"], Meta(description="Who plans in training: exact search or the trained network.")
     ] = "astar"

@@ -64,8 +64,8 @@ def parse_yaml(text: str, source: str) -> Any:
 
 
 def dump_yaml(values: dict[str, Any]) -> str:
-    """Write settings as YAML that `parse_yaml` reads back equal."""
-    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    """Write settings as YAML that `parse_yaml` reads back equal: what is not ASCII is escaped, line separators too."""
+    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, width=120)
 
 
 def decode(kind: type[S], values: Any, source: str | Callable[[str], str]) -> S:

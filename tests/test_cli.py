@@ -66,7 +66,7 @@ def write_map(folder: Path, occupied: np.ndarray) -> Path:
         ("skill: {num_envs: many}\n", ["robot.yaml: skill.num_envs = 'many', expected int >= 1"]),
         ("planner: {hypotheses: 17}\n", ["robot.yaml: planner.hypotheses = 17, expected int >= 1 and <= 16"]),
         ("robot: ant\n", ["robot.yaml: robot = 'ant', expected car | doggo | point"]),
-        ("skill: {world: maze}\n", ["robot.yaml: skill.world = 'maze', expected a world: pillar(2,2,10)"]),
+        ("skill: {worlds: [maze]}\n", ["robot.yaml: skill.worlds = ['maze'], expected", "pillar(2,2,10)"]),
         ("planner: {worlds: [maze]}\n", ["robot.yaml: planner.worlds = ['maze'], expected", "pillar(2,2,10)"]),
     ],
 )
@@ -87,17 +87,17 @@ def test_a_configuration_that_cannot_be_used_is_named_by_file_and_key(refused, t
         ("tau", "command line: 'tau', expected key.path=value"),
         ("robot=ant", "command line: robot = 'ant', expected car | doggo | point"),
         (
-            "skill.world=pillar(2,2)",
-            "skill.world = 'pillar(2,2)': world 'pillar(2,2)': 2 arguments, pillar(W,H,N) takes 3",
+            "skill.worlds=['pillar(2,2)']",
+            "skill.worlds = 'pillar(2,2)': world 'pillar(2,2)': 2 arguments, pillar(W,H,N) takes 3",
         ),
         (
-            "skill.world=pillar(0.6,0.6,9)",
-            "skill.world = 'pillar(0.6,0.6,9)': .* use fewer obstacles or a larger field",
+            "skill.worlds=['pillar(0.6,0.6,9)']",
+            "skill.worlds = 'pillar(0.6,0.6,9)': .* use fewer obstacles or a larger field",
         ),
         ("planner.planning_radius_m=3", "planner.worlds = 'pillar.*none of 100 layouts .* a smaller robot"),
         (
-            "skill.world=map(hall.yaml)",
-            "skill.world = 'map(hall.yaml)': .*: the map file cannot be read",
+            "skill.worlds=['map(hall.yaml)']",
+            "skill.worlds = 'map(hall.yaml)': .*: the map file cannot be read",
         ),
     ],
 )
@@ -114,7 +114,7 @@ def test_a_map_without_a_way_from_start_to_goal_is_refused(refused, tmp_path, re
     if command == "world":
         line = refused("world", "--kind", world, "--png", "out.png")
     elif command == "train":
-        line = refused("train", *tiny_run.SETTINGS, f"skill.world={world}")
+        line = refused("train", *tiny_run.SETTINGS, f"skill.worlds=['{world}']")
     else:
         bundle = request.getfixturevalue("able_bundle")
         line = refused("evaluate", "--bundle", bundle, "--world", world, "--episodes", 1, "--json", "out.json")

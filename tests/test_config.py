@@ -132,7 +132,7 @@ def test_an_empty_file_or_section_changes_nothing(tmp_path: Path, text: str) -> 
         ("skill: {hidden: []}", ["skill.hidden", "[]", "at least 1"]),
         ("skill: {hidden: [256, 0]}", ["skill.hidden", "[256, 0]", "int >= 1"]),
         ("skill: {stop_reach_rate: 1.5}", ["skill.stop_reach_rate", "1.5", "null or float > 0 and <= 1"]),
-        ("skill: {world: maze}", ["skill.world", "'maze'", "pillar(2,2,10)"]),
+        ("skill: {worlds: [maze]}", ["skill.worlds", "maze", "pillar(2,2,10)"]),
         ("planner: {worlds: [gremlin, maze]}", ["planner.worlds", "maze", "pillar(2,2,10)"]),
         ("planner: {preset: baseline}", ["planner.preset", "'baseline'", "default | paper"]),
         ("skill: {preset: [paper]}", ["skill.preset", "['paper']", "baseline | default | paper"]),
@@ -322,3 +322,11 @@ def test_help_describes_every_setting_with_its_type_and_default() -> None:
     assert described["skill.stop_reach_rate"].type == "null or float > 0 and <= 1"
     assert described["planner.worlds"].type.startswith("list of at least 1 of: a world")
     assert math.isclose(described["option.d_update_m"].default, 0.3)
+
+
+@pytest.mark.parametrize("name", ["\x85", "\u2028runs", "größe"])
+def test_a_folder_of_any_name_survives_writing_and_reading(tmp_path: Path, name: str) -> None:
+    file = tmp_path / "config.yaml"
+    config = msgspec.structs.replace(load_config(), run_dir=name)
+    file.write_text(dump_config(config), encoding="utf-8")
+    assert load_config(file) == config

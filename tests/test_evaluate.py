@@ -40,7 +40,7 @@ def turn_and_drive(observation: np.ndarray) -> np.ndarray:
 
 
 def policies_of(**changes: object) -> Policies:
-    config: TrainConfig = load_config(None, ["robot=point", f"skill.world={tiny_run.WORLD}"])
+    config: TrainConfig = load_config(None, ["robot=point", f"skill.worlds=['{tiny_run.WORLD}']"])
     return replace(Policies(config, turn_and_drive, None), **changes)  # type: ignore[arg-type]
 
 

@@ -58,12 +58,12 @@ def make_task(
         config: robot, option, reward and kind of guidance.
         num_rows: robots side by side.
         planner: guides them; the expert by default.
-        worlds: that `layouts` may draw from; the skill's training world by default.
+        worlds: that `layouts` may draw from; the skill's training worlds by default.
         layouts: random ones from the configuration's seed by default.
         end_on_fall: see `NavigationTask`.
     """
     robot = get_robot(config.robot)
-    worlds = [parse_world(config.skill.world)] if worlds is None else list(worlds)
+    worlds = [parse_world(text) for text in config.skill.worlds] if worlds is None else list(worlds)
     option = WaypointOption(
         planner or expert_planner(config),
         num_rows,

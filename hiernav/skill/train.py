@@ -174,9 +174,8 @@ class SkillTrainer:
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
         skill, began, first = self.config.skill, time.perf_counter(), self.steps
-        self.task.draw_from(
-            RandomLayouts([parse_world(skill.world)], (self.config.seed, 2, self.steps), self.task.robot.radius)
-        )
+        worlds = [parse_world(text) for text in skill.worlds]
+        self.task.draw_from(RandomLayouts(worlds, (self.config.seed, 2, self.steps), self.task.robot.radius))
         frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
         per_batch = skill.num_envs * max(1, min(_BATCH_FRAMES // skill.num_envs, frames // skill.num_envs))
         collector = Collector(
@@ -262,7 +261,8 @@ class SkillTrainer:
         skill = self.config.skill
         radius = self.task.robot.radius
         seeds = np.random.SeedSequence((self.config.seed, _EVALUATION_SEED)).generate_state(skill.eval_episodes)
-        layouts = [sample_layout(parse_world(skill.world), int(seed), radius) for seed in seeds]
+        worlds = [parse_world(text) for text in skill.worlds]
+        layouts = [sample_layout(worlds[i % len(worlds)], int(seed), radius) for i, seed in enumerate(seeds)]
         task = make_task(self.config, min(64, skill.eval_episodes), self.planner)
         episodes = run_episodes(task, TorchSkill(self.learner.actor), layouts)
         result = {
