@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,6 +95,31 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", metavar="FILE", help="write the results, an object per world; - for the screen")
     evaluate.set_defaults(run=_evaluate)
 
+    watch = commands.add_parser(
+        "watch",
+        help="film policies at work",
+        description="Film the first episodes that `hiernav evaluate` would drive with the same seed: field, robot, "
+        "waypoints, where plans were replaced and why, and collisions.",
+        epilog="A film is named after its world; MP4 where OpenCV can encode it, GIF elsewhere.",
+    )
+    watch.add_argument("run_path", nargs="?", metavar="RUN", help="a run folder (the newest one in runs/)")
+    watch.add_argument("--bundle", metavar="DIR", help="an exported bundle instead of a run")
+    watch.add_argument("--world", action="append", metavar="WORLD", help="a world; repeat for several (pillar(2,2,10))")
+    watch.add_argument("--episodes", type=int, default=3, metavar="N", help="per world (3)")
+    watch.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
+    watch.add_argument(
+        "--planner", choices=("cnn", "astar"), help="who plans (cnn, or astar where there is no cnn yet)"
+    )
+    watch.add_argument("--view", choices=("top", "mujoco"), default="top", help="mujoco adds MuJoCo's camera (top)")
+    watch.add_argument("--lidar", action="store_true", help="draw what the lidar reads")
+    watch.add_argument("--speed", type=float, default=1.0, help="of the film; 1 is the robot's own (1)")
+    watch.add_argument("--fps", type=float, help="frames per second (one for each control step, at most 25)")
+    watch.add_argument("--size", type=int, default=480, metavar="PIXELS", help="longer side of the field (480)")
+    watch.add_argument(
+        "--out", type=Path, metavar="PATH", help="a film ending in .mp4 or .gif, or a folder (RUN/films, or runs/films)"
+    )
+    watch.set_defaults(run=_watch)
+
     export = commands.add_parser(
         "export",
         help="turn a run into a bundle of ONNX files",
@@ -155,7 +181,10 @@ def _train(arguments: argparse.Namespace) -> int:
         return INTERRUPTED
     finally:
         run.close()
-    print(f"done; export with: hiernav export --run {run.path} --onnx")
+    if run.config.skill.preset == "baseline":
+        print(f"done; measure with: hiernav evaluate --run {run.path}")
+    else:
+        print(f"done; export with: hiernav export --run {run.path} --onnx")
     return 0
 
 
@@ -195,6 +224,58 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         _print_results(results)
         if arguments.json:
             _write_json(Path(arguments.json), results)
+    return 0
+
+
+def _watch(arguments: argparse.Namespace) -> int:
+    from hiernav.film.gl import choose_gl
+
+    if arguments.view == "mujoco":
+        choose_gl()
+    from hiernav.evaluate import open_policies
+    from hiernav.film.film import FilmSettings, film_name, make_film
+    from hiernav.film.writer import SUFFIXES, default_suffix
+    from hiernav.run import newest_run
+    from hiernav.sim.layout import parse_world
+
+    worlds = [parse_world(text) for text in arguments.world or ["pillar(2,2,10)"]]
+    settings = FilmSettings(arguments.view, arguments.lidar, arguments.size, arguments.speed, arguments.fps)
+    if arguments.run_path and arguments.bundle:
+        raise ValueError("a run and a bundle at once: leave out one of them")
+    source = Path(arguments.bundle or arguments.run_path or newest_run())
+    policies = open_policies(source)
+    planner = arguments.planner or ("cnn" if policies.network is not None else "astar")
+    if arguments.planner is None and planner == "astar":
+        print(f"{source} has no planner network yet: the shortest-path planner plans", file=sys.stderr)
+    out = arguments.out or (Path("runs/films") if arguments.bundle else source / "films")
+    if out.suffix not in SUFFIXES:
+        films = {world: out / f"{film_name(world)}{default_suffix()}" for world in worlds}
+    elif len(worlds) == 1:
+        films = {worlds[0]: out}
+    else:
+        raise ValueError(f"--out {out} is one film, and there are {len(worlds)} worlds: name a folder")
+    with _progress() as progress:
+        tasks = {world: progress.add_task(str(world), total=arguments.episodes, note="") for world in worlds}
+        for world, film in films.items():
+            began = time.perf_counter()
+
+            def show(frames: int, task: Any = tasks[world], began: float = began) -> None:
+                rate = frames / max(time.perf_counter() - began, 1e-6)
+                progress.update(task, note=f"{frames:,} frames  {rate:.0f} frames/s")
+
+            episodes = make_film(
+                policies,
+                world,
+                film,
+                episodes=arguments.episodes,
+                seed=arguments.seed,
+                planner=planner,
+                settings=settings,
+                on_frame=show,
+                on_episode=lambda *_, task=tasks[world]: progress.advance(task),
+            )
+            reached = sum(episode.reached for episode in episodes)
+            print(f"{film}: {len(episodes)} episodes, {reached} reached the goal")
     return 0
 
 

@@ -58,7 +58,10 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     preset: Annotated[
         Literal["default", "paper", "baseline"],
-        Meta(description="`baseline`: no waypoints, the goal instead. Also the preset of `option` and `reward`."),
+        Meta(
+            description="`paper`: as published; `baseline`: no waypoints, the goal instead. "
+            "Also the preset of `option` and `reward`."
+        ),
     ] = "default"
     worlds: Annotated[tuple[World, ...], Meta(min_length=1, description="Worlds to train in, in equal parts.")] = (
         "pillar(2,2,10)",
@@ -97,6 +100,9 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ] = None
     mirror: Annotated[bool, Meta(description="Reflect half of every batch left to right.")] = True
     end_on_fall: Annotated[bool, Meta(description="End a training episode when the robot has turned over.")] = True
+    greedy_share: Annotated[
+        float, Meta(ge=0, le=1, description="Share of simulations that act without noise, as the exported skill does.")
+    ] = 0.0
     clock: Annotated[bool, Meta(description="Show the skill a gait clock of 3 Hz.")] = False
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"],
@@ -163,29 +169,35 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reward: RewardConfig = RewardConfig()
 
 
-_PAPER_SAC: dict[str, Any] = {
-    "num_envs": 1,
-    "total_steps": 3_000_000,
-    "learning_starts": 10_000,
-    "updates_per_step": 1.0,
-    "discount": 0.99,
-    "init_alpha": 1.0,
-    "alpha_floor": 0.0,
-    "mirror": False,
-    "end_on_fall": False,
-}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "planner": {
         "paper": {"weight_decay": 0.0, "hypotheses": 1, "clearance_weight": 0.0, "mirror": False, "soft_margin_m": 0.0},
     },
     "skill": {
-        "paper": _PAPER_SAC | {"planner": "cnn"},
-        "baseline": _PAPER_SAC,
+        "paper": {
+            "planner": "cnn",
+            "num_envs": 1,
+            "total_steps": 3_000_000,
+            "learning_starts": 10_000,
+            "updates_per_step": 1.0,
+            "discount": 0.99,
+            "init_alpha": 1.0,
+            "alpha_floor": 0.0,
+            "mirror": False,
+            "end_on_fall": False,
+        },
     },
     "option": {"paper": {"invalid": False}},
     "reward": {
         "paper": {"leave_field": 0.0, "fall": 0.0},
-        "baseline": {"leave_field": 0.0, "fall": 0.0, "path_distance": 0.0, "progress": 0.0, "goal_distance": -1.0},
+        # every step costs the distance to the goal, so that an early end has to cost more than all steps it spares
+        "baseline": {
+            "leave_field": -60.0,
+            "fall": -60.0,
+            "path_distance": 0.0,
+            "progress": 0.0,
+            "goal_distance": -1.0,
+        },
     },
 }
 """Section -> preset -> the values that differ from the field defaults."""

@@ -21,7 +21,7 @@ from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
 from hiernav.runtime.policy import load_policies
-from hiernav.sim.factory import expert_planner, make_task, skill_layout
+from hiernav.sim.factory import default_planner, expert_planner, make_task, skill_layout
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes
@@ -61,7 +61,11 @@ def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:
     Args:
         kind: "cnn" (the trained network) or "astar" (the expert).
         repair: whether plans of the network that collide are replaced by the expert's.
+
+    A baseline, which follows no plan, gets none, whatever the kind.
     """
+    if policies.config.skill.preset == "baseline":
+        return default_planner(policies.config)
     expert = expert_planner(policies.config)
     if kind == "astar":
         return expert
@@ -115,7 +119,7 @@ def evaluate(
             "world": name,
             "robot": policies.config.robot,
             "protocol": protocol,
-            "planner": planner,
+            "planner": "none" if policies.config.skill.preset == "baseline" else planner,
             "seed": seed,
             **summarize(done),
             **_plan_counts(plan),

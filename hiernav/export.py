@@ -69,6 +69,8 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
     run, out = Run.open(run_path), Path(out)
     if out.exists() and not (out / MANIFEST).exists() and (out.is_file() or any(out.iterdir())):
         raise RunError(f"{out} is not a bundle and not empty: choose another folder to export to")
+    if run.config.skill.preset == "baseline":
+        raise RunError(f"{run.path} holds a baseline, which follows no plan: a bundle needs a planner")
     states = {stage: run.load(stage) for stage in ("planner", "skill")}
     for stage, state in states.items():
         if state is None:

@@ -8,6 +8,7 @@ import time
 import torch
 from rich.progress import Progress, TaskID
 
+from hiernav.nav.option import Planner
 from hiernav.planner import train as planner_train
 from hiernav.run import Run
 from hiernav.skill import train as skill_train
@@ -22,6 +23,10 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         TrainingDiverged: a loss is not finite.
     """
     torch.set_num_threads(run.config.threads)
+    if run.config.skill.preset == "baseline":
+        if stage == "planner":
+            raise ValueError("skill.preset = baseline follows no plan: it has no planner stage")
+        return _train_skill(run, None, progress)
     planner = planner_train.PlannerTrainer(run.config, run)
     done = planner.resume()
     if done is not None and not planner.finished:
@@ -36,14 +41,18 @@ def train(run: Run, stage: str, progress: Progress) -> None:
             if not planner.finished:
                 raise ValueError("skill.planner = cnn needs a trained planner: run the planner stage first")
             guide = planner_train.torch_planner(planner.network, planner.labels.radius)
-        skill = skill_train.SkillTrainer(run.config, run, guide)
-        steps = skill.resume()
-        if steps is not None and not skill.finished:
-            progress.console.print(f"skill: going on after step {steps:,} of {run.config.skill.total_steps:,}")
-        began = time.perf_counter()
-        skill.train(_SkillDisplay(progress))
-        best = max(skill.evaluations, key=skill_train.merit)
-        run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
+        _train_skill(run, guide, progress)
+
+
+def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
+    skill = skill_train.SkillTrainer(run.config, run, guide)
+    steps = skill.resume()
+    if steps is not None and not skill.finished:
+        progress.console.print(f"skill: going on after step {steps:,} of {run.config.skill.total_steps:,}")
+    began = time.perf_counter()
+    skill.train(_SkillDisplay(progress))
+    best = max(skill.evaluations, key=skill_train.merit)
+    run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
 
 
 class _Display:

@@ -70,7 +70,7 @@ def test_option_and_reward_follow_the_preset_of_the_skill() -> None:
     assert paper.reward.preset == "paper"
     baseline = load_config(overrides=["skill.preset=baseline"])
     assert baseline.reward == RewardConfig(
-        preset="baseline", path_distance=0.0, progress=0.0, leave_field=0.0, fall=0.0, goal_distance=-1.0
+        preset="baseline", path_distance=0.0, progress=0.0, leave_field=-60.0, fall=-60.0, goal_distance=-1.0
     )
     assert load_config(overrides=["skill.preset=paper", "reward.preset=default"]).reward == RewardConfig()
 

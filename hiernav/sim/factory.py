@@ -9,7 +9,7 @@ import numpy as np
 from hiernav.config import TrainConfig
 from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, ReplanRule, WaypointOption
-from hiernav.nav.planners import ShortestPathPlanner
+from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.task import LayoutSource, NavigationTask
@@ -44,6 +44,13 @@ def expert_planner(config: TrainConfig) -> ShortestPathPlanner:
     )
 
 
+def default_planner(config: TrainConfig) -> Planner:
+    """The expert, or no planner worth the name for a baseline that follows no plan."""
+    if config.skill.preset == "baseline":
+        return StraightPlanner(config.option.waypoints, config.option.spacing_m)
+    return expert_planner(config)
+
+
 def make_task(
     config: TrainConfig,
     num_rows: int,
@@ -57,7 +64,7 @@ def make_task(
     Args:
         config: robot, option, reward and kind of guidance.
         num_rows: robots side by side.
-        planner: guides them; the expert by default.
+        planner: guides them; `default_planner` by default.
         worlds: that `layouts` may draw from; the skill's training worlds by default.
         layouts: random ones from the configuration's seed by default.
         end_on_fall: see `NavigationTask`.
@@ -65,7 +72,7 @@ def make_task(
     robot = get_robot(config.robot)
     worlds = [parse_world(text) for text in config.skill.worlds] if worlds is None else list(worlds)
     option = WaypointOption(
-        planner or expert_planner(config),
+        planner or default_planner(config),
         num_rows,
         replan_rule(config),
         num_waypoints=config.option.waypoints,

@@ -30,7 +30,7 @@ from hiernav.sim.worlds import sample_layout
 from hiernav.skill.env import NavigationEnv
 from hiernav.skill.networks import Actor
 from hiernav.skill.replay import Replay, mirror_half
-from hiernav.skill.sac import Learner, SacSettings
+from hiernav.skill.sac import Learner, PartlyGreedy, SacSettings
 
 _WINDOW = 200
 """Episodes that running means are taken over."""
@@ -180,7 +180,7 @@ class SkillTrainer:
         per_batch = skill.num_envs * max(1, min(_BATCH_FRAMES // skill.num_envs, frames // skill.num_envs))
         collector = Collector(
             self.env,
-            self.learner.policy,
+            PartlyGreedy(self.learner.policy, skill.greedy_share),
             frames_per_batch=per_batch,
             total_frames=max(1, frames // per_batch) * per_batch,
             init_random_frames=-(-max(0, skill.learning_starts - self.steps) // per_batch) * per_batch,

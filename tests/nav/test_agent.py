@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from nav_planners import StraightPlanner, map_with_pillars
+from nav_planners import map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.frames import body_to_world
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import HierarchicalAgent, TerminationReason, WaypointOption
+from hiernav.nav.planners import StraightPlanner
 
 NONE, START = TerminationReason.NONE, TerminationReason.START
 FREE = map_with_pillars()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nav_planners import StraightPlanner, map_with_pillars
+from nav_planners import WatchedPlanner, map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.option import ReplanRule, TerminationReason, WaypointOption
@@ -22,7 +22,7 @@ class Drive:
     """An option and the robots under it; every call of `at` is one control step."""
 
     def __init__(self, num_rows: int = 1, rule: ReplanRule = DEFAULT, goal: object = FAR) -> None:
-        self.planner = StraightPlanner()
+        self.planner = WatchedPlanner()
         self.option = WaypointOption(self.planner, num_rows, rule)
         self.goal = np.broadcast_to(np.asarray(goal, float), (num_rows, 2)).copy()
         self.map = FREE

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nav_planners import StraightPlanner, map_with_pillars, pillar_world, query_of
+from nav_planners import WatchedPlanner, map_with_pillars, pillar_world, query_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav import goselo
@@ -140,8 +140,8 @@ def test_the_plans_of_the_expert_pass_the_sweep(seed: int) -> None:
 # verification
 
 
-def verified(radius: float = 0.1) -> tuple[VerifiedPlanner, StraightPlanner]:
-    straight_planner = StraightPlanner()
+def verified(radius: float = 0.1) -> tuple[VerifiedPlanner, WatchedPlanner]:
+    straight_planner = WatchedPlanner()
     return VerifiedPlanner(straight_planner, ShortestPathPlanner(radius, soft_margin=0.05), radius), straight_planner
 
 
