@@ -168,7 +168,7 @@ def _train(arguments: argparse.Namespace) -> int:
     else:
         config = load_config(arguments.config, arguments.overrides)
         _check_worlds(config)
-        _need_training_packages()
+        _check_machine(config)
         run = Run.create(config)
     from hiernav.training import train
 
@@ -354,11 +354,15 @@ def _check_worlds(config: TrainConfig) -> None:
                 raise ConfigError(f"{key} = {text!r}: {error}") from None
 
 
-def _need_training_packages() -> None:
-    """Fail before a run folder is made when the training extra is not installed."""
+def _check_machine(config: TrainConfig) -> None:
+    """Fail before a run folder is made when what the training needs is not installed, or there is no such device."""
     import tensorboard  # noqa: F401
-    import torch  # noqa: F401
     import torchrl  # noqa: F401
+
+    from hiernav.device import choose_device
+
+    choose_device(config.planner.device, "planner.device")
+    choose_device(config.skill.device, "skill.device")
 
 
 def _print_results(results: dict[str, dict[str, Any]]) -> None:

@@ -23,6 +23,7 @@ __all__ = [
 _WORLD_PATTERN = r"^(pillar\([^()]+\)|(gremlin|two-room|four-room)(\([^()]+\))?|map\(.+\)|.+\.ya?ml)$"
 _WORLD_HELP = "a world: pillar(2,2,10), gremlin, two-room, four-room, map(file.yaml)"
 World = Annotated[str, Meta(pattern=_WORLD_PATTERN, extra={"accepts": _WORLD_HELP})]
+Device = Literal["auto", "cpu", "cuda"]
 Width = Annotated[int, Meta(ge=1, le=8192)]
 
 
@@ -34,6 +35,7 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     samples_per_world: Annotated[int, Meta(ge=1, description="Starts labelled by one shortest-path field.")] = 100
     epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 6
     batch_size: Annotated[int, Meta(ge=1, description="Samples per update.")] = 256
+    device: Annotated[Device, Meta(description="Where the network learns; auto: on a GPU where there is one.")] = "auto"
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimiser.")] = 1e-3
     weight_decay: Annotated[float, Meta(ge=0, le=1, description="Decoupled weight decay of the optimiser.")] = 1e-4
     hypotheses: Annotated[int, Meta(ge=1, le=16, description="Plans proposed at once; the best one learns.")] = 4
@@ -75,6 +77,9 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         2_000
     )
     updates_per_step: Annotated[float, Meta(gt=0, le=64, description="Gradient updates per control step.")] = 0.5
+    device: Annotated[Device, Meta(description="Where updates are computed; auto: on a GPU where there is one.")] = (
+        "auto"
+    )
     batch_size: Annotated[int, Meta(ge=1, description="Transitions per update.")] = 256
     buffer_size: Annotated[int, Meta(ge=1, description="Transitions kept for replay.")] = 1_000_000
     hidden: Annotated[tuple[Width, ...], Meta(min_length=1, description="Widths of the hidden layers.")] = (256, 256)

@@ -135,7 +135,7 @@ def _read_checkpoint(file: Path) -> dict[str, Any]:
     import torch
 
     try:
-        return torch.load(file, weights_only=True)
+        return torch.load(file, weights_only=True, map_location="cpu")
     except Exception as error:  # a damaged file fails in any of a dozen ways
         raise RunError(
             f"{file} cannot be read ({type(error).__name__}): restore it, or remove it and train with --resume"

@@ -18,18 +18,19 @@ ALLOWED = {
     "envs": set(),
     "decode": set(),
     "config": {"decode"},
+    "device": {"decode"},
     "nav": set(),
     "sim": {"nav", "config"},
     "run": {"config"},
-    "planner": {"nav", "sim", "config", "run"},
-    "skill": {"nav", "sim", "config", "run"},
+    "planner": {"nav", "sim", "config", "run", "device"},
+    "skill": {"nav", "sim", "config", "run", "device"},
     "training": {"planner", "skill", "run"},
     "runtime": {"nav", "decode"},
     "evaluate": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
     "report": {"nav", "sim", "evaluate", "config", "draw"},
-    "cli": {"nav", "sim", "evaluate", "export", "report", "draw", "config", "decode", "run", "training"},
+    "cli": {"nav", "sim", "evaluate", "export", "report", "draw", "config", "decode", "run", "training", "device"},
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
 TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}

@@ -70,15 +70,16 @@ class HypothesisNetwork(nn.Module):
 
 
 class TorchNetwork:
-    """A waypoint network as `hiernav.nav.planners.Network`: numpy in and out."""
+    """A waypoint network as `hiernav.nav.planners.Network`: numpy in and out, computed where the weights are."""
 
     def __init__(self, network: nn.Module) -> None:
         self.network = network.eval()
 
     @torch.no_grad()
     def __call__(self, image: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        waypoints, scores = self.network(torch.from_numpy(image), torch.from_numpy(distance))
-        return waypoints.numpy(), scores.numpy()
+        device = next(self.network.parameters()).device
+        waypoints, scores = self.network(torch.from_numpy(image).to(device), torch.from_numpy(distance).to(device))
+        return waypoints.cpu().numpy(), scores.cpu().numpy()
 
 
 def make_network(preset: str, waypoints: int, spacing: float, hypotheses: int) -> PaperNetwork | HypothesisNetwork:

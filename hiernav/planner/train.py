@@ -12,6 +12,7 @@ from torch import nn
 from torch.nn import functional
 
 from hiernav.config import TrainConfig
+from hiernav.device import choose_device, random_state, restore_random_state
 from hiernav.nav import goselo
 from hiernav.nav.planners import GoseloPlanner
 from hiernav.planner.dataset import LabelSettings, Samples, make_samples
@@ -53,9 +54,10 @@ class PlannerTrainer:
         radius = planner.planning_radius_m or get_robot(config.robot).radius
         seed = np.random.SeedSequence((config.seed, 3)).generate_state(1)
         torch.manual_seed(int(seed[0]))
+        self.device = choose_device(planner.device, "planner.device")
         self.network = make_network(
             planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
-        ).to(memory_format=torch.channels_last)
+        ).to(self.device, memory_format=torch.channels_last)
         self.labels = LabelSettings(
             worlds=planner.worlds,
             radius=radius,
@@ -84,7 +86,7 @@ class PlannerTrainer:
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.schedule.load_state_dict(state["schedule"])
-        torch.set_rng_state(state["torch_rng"])
+        restore_random_state(state, self.device)
         self.epoch, self.validation = state["epoch"], state["validation"]
         return self.epoch
 
@@ -129,9 +131,9 @@ class PlannerTrainer:
         order = torch.randperm(len(samples)).numpy()
         for first in range(0, len(order), planner.batch_size):
             rows = np.sort(order[first : first + planner.batch_size])
-            batch = _tensors(samples, rows)
+            batch = _tensors(samples, rows, self.device)
             if planner.mirror:
-                batch = _mirror(batch, torch.rand(len(rows)) < 0.5)
+                batch = _mirror(batch, (torch.rand(len(rows)) < 0.5).to(self.device))
             loss = plan_loss(self.network, batch, self._margin, planner.clearance_weight)
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -154,9 +156,10 @@ class PlannerTrainer:
         self.network.eval()
         errors, hits = [], []
         for first in range(0, len(samples), 500):
-            image, clearance, distance, label = _tensors(samples, np.arange(first, min(first + 500, len(samples))))
+            rows = np.arange(first, min(first + 500, len(samples)))
+            image, clearance, distance, label = _tensors(samples, rows, self.device)
             waypoints, scores = self.network(image, distance)
-            chosen = waypoints[torch.arange(len(label)), scores.argmax(dim=1)]
+            chosen = waypoints[torch.arange(len(label), device=self.device), scores.argmax(dim=1)]
             errors.append((chosen - label).norm(dim=-1).mean(dim=-1))
             hits.append((clearance_at(clearance, chosen[:, None])[:, 0] < self.labels.radius).float().mean(dim=-1))
         return {"error": float(torch.cat(errors).mean()), "blocked_waypoints": float(torch.cat(hits).mean())}
@@ -178,7 +181,7 @@ class PlannerTrainer:
                 "network": self.network.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "schedule": self.schedule.state_dict(),
-                "torch_rng": torch.get_rng_state(),
+                **random_state(self.device),
                 "epoch": self.epoch,
                 "validation": self.validation,
             },
@@ -229,9 +232,10 @@ def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisN
     return network.eval()
 
 
-def _tensors(samples: Samples, rows: np.ndarray) -> Batch:
+def _tensors(samples: Samples, rows: np.ndarray, device: torch.device) -> Batch:
     image, clearance, distance, label = (
-        torch.from_numpy(values[rows]) for values in (samples.image, samples.clearance, samples.distance, samples.label)
+        torch.from_numpy(values[rows]).to(device)
+        for values in (samples.image, samples.clearance, samples.distance, samples.label)
     )
     # channels last: convolutions of few channels take half the time, those of the paper's network a quarter
     return image.contiguous(memory_format=torch.channels_last), clearance, distance, label

@@ -42,7 +42,7 @@ class DirectSACLoss(SACLoss):
         self._frozen = [(weight.detach(), bias.detach(), relu) for weight, bias, relu in self._critics]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with torch.autocast("cpu", self._precision, enabled=self._reduced):
+        with torch.autocast(self._scales[0].device.type, self._precision, enabled=self._reduced):
             return self._losses(tensordict)
 
     def _losses(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -87,7 +87,7 @@ def _sample(layers: list[Layer], scaled: torch.Tensor) -> tuple[torch.Tensor, to
         hidden = functional.linear(hidden, weight, bias)
         hidden = hidden.relu() if relu else hidden
     weight, bias, _ = layers[-1]
-    with torch.autocast("cpu", enabled=False):
+    with torch.autocast(hidden.device.type, enabled=False):
         loc, raw = functional.linear(hidden.float(), weight, bias).chunk(2, dim=-1)
     low, high = LOG_STD_RANGE
     log_std = low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0)
@@ -109,5 +109,5 @@ def _values(layers: list[Layer], scaled: torch.Tensor, action: torch.Tensor) -> 
             hidden = functional.layer_norm(hidden, hidden.shape[-1:]) * weight[:, None] + bias[:, None]
         hidden = hidden.relu() if relu else hidden
     weight, bias, _ = layers[-1]
-    with torch.autocast("cpu", enabled=False):
+    with torch.autocast(hidden.device.type, enabled=False):
         return torch.baddbmm(bias[:, None], hidden.float(), weight.mT)

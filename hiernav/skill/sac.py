@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Sequence
@@ -65,35 +66,48 @@ class PartlyGreedy(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-def choose_precision(name: str) -> torch.dtype:
-    """The type behind a name; "auto" is bfloat16 where the processor multiplies it natively."""
+def choose_precision(name: str, device: torch.device) -> torch.dtype:
+    """The type behind a name; "auto" is bfloat16 where a processor multiplies it natively, not on a GPU.
+
+    (A GPU is busy starting kernels at these sizes: the conversions would cost more than the products save.)
+    """
     if name == "auto":
-        name = "bfloat16" if torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported() else "float32"
+        native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+        name = "bfloat16" if device.type == "cpu" and native else "float32"
     return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
 
 
 class Learner:
     """Actor, twin critics, temperature and their optimiser.
 
-    The three losses touch disjoint parameters, so one backward pass and one optimiser step serve all.
+    The three losses touch disjoint parameters, so one backward pass and one optimiser step serve all. `actor` and
+    `policy` act on the processor, beside the simulations; what learns on a GPU is a copy of them, see `publish`.
+
+    Args:
+        layout: of the observation.
+        action_dim: number of actions.
+        settings: hyper-parameters.
+        device: that updates are computed on.
     """
 
-    def __init__(self, layout: ObservationLayout, action_dim: int, settings: SacSettings) -> None:
-        self.settings = settings
-        self.actor = Actor(layout, action_dim, settings.hidden, layer_norm=False)
-        self.policy = ProbabilisticActor(
-            TensorDictModule(self.actor, in_keys=["observation"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            distribution_kwargs={"low": -1.0, "high": 1.0, "tanh_loc": False, "safe_tanh": False},
-            default_interaction_type=InteractionType.RANDOM,
-            spec=Bounded(-1.0, 1.0, (action_dim,)),
-        )
+    def __init__(
+        self,
+        layout: ObservationLayout,
+        action_dim: int,
+        settings: SacSettings,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.settings, self.device = settings, torch.device(device)
+        self.actor = self._learning = Actor(layout, action_dim, settings.hidden, layer_norm=False)
+        self.policy = learning = make_policy(self.actor, action_dim)
         critic = Critic(layout, action_dim, settings.hidden, settings.layer_norm)
+        if self.device.type != "cpu":
+            self._learning = copy.deepcopy(self.actor).to(self.device)
+            learning = make_policy(self._learning, action_dim)
         self.loss = DirectSACLoss(
-            self.policy,
-            ValueOperator(critic, in_keys=["observation", "action"]),
-            precision=choose_precision(settings.precision),
+            learning,
+            ValueOperator(critic.to(self.device), in_keys=["observation", "action"]),
+            precision=choose_precision(settings.precision, self.device),
             loss_function="l2",
             alpha_init=settings.init_alpha,
             min_alpha=max(settings.alpha_floor, _LEAST_ALPHA),
@@ -108,8 +122,8 @@ class Learner:
         self.updates = 0
 
     def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
-        """One gradient step on a batch (B,) of transitions; returns detached scalars."""
-        out = self.loss(batch)
+        """One gradient step on a batch (B,) of transitions; returns detached scalars on the learner's device."""
+        out = self.loss(batch.to(self.device))
         total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -118,6 +132,11 @@ class Learner:
             torch._foreach_lerp_(self._target, self._online, self.settings.tau)
         self.updates += 1
         return {key: value.detach() for key, value in out.items()}
+
+    def publish(self) -> None:
+        """Let the acting policy have the weights learnt so far; where it is the one that learns, it has them."""
+        if self._learning is not self.actor:
+            self.actor.load_state_dict(self._learning.state_dict())
 
     def set_alpha_floor(self, floor: float) -> None:
         """Keep the temperature at or above `floor`; 0 lets it fall freely."""
@@ -131,3 +150,16 @@ class Learner:
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.updates = state["updates"]
+        self.publish()
+
+
+def make_policy(actor: Actor, action_dim: int) -> ProbabilisticActor:
+    """The exploring policy of an actor: "observation" (N, D) -> "action" (N, A), drawn anew each time."""
+    return ProbabilisticActor(
+        TensorDictModule(actor, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0, "tanh_loc": False, "safe_tanh": False},
+        default_interaction_type=InteractionType.RANDOM,
+        spec=Bounded(-1.0, 1.0, (action_dim,)),
+    )

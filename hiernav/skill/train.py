@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 
 from hiernav.config import SkillConfig, TrainConfig
+from hiernav.device import choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.run import Run, RunError, TrainingDiverged
@@ -83,7 +84,8 @@ def make_learner(config: TrainConfig) -> Learner:
         layer_norm=skill.layer_norm,
         precision=skill.precision,
     )
-    return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings)
+    device = choose_device(skill.device, "skill.device")
+    return Learner(skill_layout(config), get_robot(config.robot).action_dim, settings, device)
 
 
 def alpha_floor(skill: SkillConfig, steps: int) -> float:
@@ -143,7 +145,7 @@ class SkillTrainer:
             return None
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
-        torch.set_rng_state(state["torch_rng"])
+        restore_random_state(state, self.learner.device)
         self.steps, self._due = state["steps"], state["due"]
         self.evaluations, self.best_actor = state["evaluations"], state["best_actor"]
         self._episodes.reached.extend(state["reached"])
@@ -224,6 +226,7 @@ class SkillTrainer:
         while self._due >= 1.0:
             metrics = self.learner.update(self._batch())
             self._due -= 1.0
+        self.learner.publish()
         values = {key: float(value) for key, value in metrics.items()}
         broken = [key for key, value in values.items() if not np.isfinite(value)]
         if broken:
@@ -284,7 +287,7 @@ class SkillTrainer:
             {
                 "learner": self.learner.state_dict(),
                 "replay": self.replay.state_dict(),
-                "torch_rng": torch.get_rng_state(),
+                **random_state(self.learner.device),
                 "steps": self.steps,
                 "due": self._due,
                 "evaluations": self.evaluations,
