@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from hiernav.sim.layout import (
     GOAL_RADIUS,
@@ -28,6 +30,46 @@ DRIVE_KEYS = ("path", "plans", "collisions", "title")
 ARROW_LENGTH = 0.35  # [m], longer in fields of more than 7 m
 DOTS_PER_INCH = 200
 _LONG_SIDE_INCH = 6.0
+_DASHES = (0, (4, 3))
+_SCREEN_DOTS_PER_INCH = 100
+_FIELD_MARGIN_PIXELS = 8.0
+
+
+@dataclass(frozen=True)
+class FieldPicture:
+    """A layout's field seen from above, and where the world lies in it."""
+
+    pixels: NDArray[np.uint8]
+    """(H, W, 3) RGB."""
+    pixels_per_metre: float
+    corner: tuple[float, float]
+    """x, y of the upper left corner, world frame [m]."""
+
+    def pixel_of(self, points: ArrayLike) -> NDArray[np.float64]:
+        """World (..., 2) [m] -> column and row (..., 2) in pixels, whole numbers at the corners of pixels."""
+        offset = np.asarray(points, dtype=np.float64) - self.corner
+        return offset * (self.pixels_per_metre, -self.pixels_per_metre)
+
+
+def field_picture(layout: Layout, long_side: int) -> FieldPicture:
+    """What stands still in a layout, its start and its goal; the longer side of the picture has `long_side` pixels."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    xmin, xmax, ymin, ymax = layout.extent
+    scale = (long_side - 2.0 * _FIELD_MARGIN_PIXELS) / max(xmax - xmin, ymax - ymin)
+    margin = _FIELD_MARGIN_PIXELS / scale
+    width, height = (round(scale * side + 2.0 * _FIELD_MARGIN_PIXELS) for side in (xmax - xmin, ymax - ymin))
+    figure = Figure(figsize=(width / _SCREEN_DOTS_PER_INCH, height / _SCREEN_DOTS_PER_INCH), dpi=_SCREEN_DOTS_PER_INCH)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.axis("off")
+    _draw_field(axes, layout)
+    _draw_task(axes, layout)
+    left, top = xmin - margin, ymax + margin
+    axes.set(xlim=(left, left + width / scale), ylim=(top - height / scale, top))
+    canvas.draw()
+    return FieldPicture(np.asarray(canvas.buffer_rgba())[..., :3].copy(), scale, (left, top))
 
 
 def draw_layout(layout: Layout, path: str | Path, drive: Mapping[str, Any] | None = None) -> None:
@@ -57,6 +99,7 @@ def draw_layout(layout: Layout, path: str | Path, drive: Mapping[str, Any] | Non
     axes.grid(color="#e2e0da", linewidth=0.6)
 
     entries = _draw_field(axes, layout)
+    entries |= _draw_gremlins(axes, layout)
     entries |= _draw_drive(axes, drive)
     entries |= _draw_task(axes, layout)
 
@@ -107,16 +150,21 @@ def _draw_field(axes: Axes, layout: Layout) -> dict[str, Artist]:
         axes.add_patch(Rectangle(center - half, *(2.0 * half), zorder=2, facecolor=OBSTACLE, edgecolor="none"))
     if len(layout.walls):
         entries["wall"] = Patch(facecolor=OBSTACLE)
+    for center in layout.gremlins:
+        axes.add_patch(Circle(center, GREMLIN_ORBIT, fill=False, edgecolor=GREMLIN, linewidth=0.9, linestyle=_DASHES))
+    if len(layout.gremlins):
+        entries["gremlins' circles, 1 rad/s"] = Line2D([], [], color=GREMLIN, linewidth=0.9, linestyle=_DASHES)
+    return entries
+
+
+def _draw_gremlins(axes: Axes, layout: Layout) -> dict[str, Artist]:
+    from matplotlib.patches import Patch, Rectangle
+
     side = 2.0 * GREMLIN_HALF_SIZE
-    for center, (x, y) in zip(layout.gremlins, layout.gremlin_positions(0.0), strict=True):
-        orbit = Circle(center, GREMLIN_ORBIT, fill=False, edgecolor=GREMLIN, linewidth=0.9, linestyle=(0, (4, 3)))
-        axes.add_patch(orbit)
+    for x, y in layout.gremlin_positions(0.0):
         corner = (x - GREMLIN_HALF_SIZE, y - GREMLIN_HALF_SIZE)
         axes.add_patch(Rectangle(corner, side, side, facecolor=GREMLIN, edgecolor=EDGE, linewidth=0.8, zorder=2))
-    if len(layout.gremlins):
-        entries["gremlin (t = 0)"] = Patch(facecolor=GREMLIN, edgecolor=EDGE)
-        entries["its circle, 1 rad/s"] = Line2D([], [], color=GREMLIN, linewidth=0.9, linestyle=(0, (4, 3)))
-    return entries
+    return {"gremlin (t = 0)": Patch(facecolor=GREMLIN, edgecolor=EDGE)} if len(layout.gremlins) else {}
 
 
 def _draw_task(axes: Axes, layout: Layout) -> dict[str, Artist]:

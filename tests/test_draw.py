@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from hiernav.draw import draw_layout
+from hiernav.draw import OBSTACLE, draw_layout, field_picture
 from hiernav.sim.worlds import parse_world, sample_layout
 
 COLLISION_BGR = (0x24, 0x24, 0xE0)
@@ -55,6 +55,23 @@ def test_a_map_file_is_drawn(tmp_path: Path) -> None:
         "free_thresh: 0.196\n"
     )
     assert count(drawn(tmp_path, str(tmp_path / "hall.yaml")), OBSTACLE_BGR) > 50000
+
+
+@pytest.mark.parametrize(("world", "shape"), [("pillar(2,2,10)", (600, 600)), ("pillar(3,1.5,8)", (308, 600))])
+def test_a_picture_of_a_field_is_true_to_scale(world: str, shape: tuple[int, int]) -> None:
+    layout = sample_layout(parse_world(world), 7)
+    picture = field_picture(layout, 600)
+    assert picture.pixels.shape == (*shape, 3)
+    columns, rows = np.floor(picture.pixel_of(layout.pillars)).astype(int).T
+    obstacle = [int(OBSTACLE[k : k + 2], 16) for k in (1, 3, 5)]
+    assert (picture.pixels[rows, columns] == obstacle).all()
+    share = (np.abs(picture.pixels.astype(int) - obstacle).max(axis=-1) <= 2).sum() / picture.pixels_per_metre**2
+    assert 0.8 < share / (len(layout.pillars) * np.pi * 0.2**2) < 1.05
+
+
+def test_a_picture_of_a_field_leaves_out_what_moves() -> None:
+    picture = field_picture(sample_layout(parse_world("gremlin"), 7), 300)
+    assert count(picture.pixels[..., ::-1], GREMLIN_BGR) < 200
 
 
 def test_a_drive_is_drawn_over_the_layout(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ def run_episodes(
     skill: Skill,
     layouts: Sequence[Layout],
     on_episode: Callable[[int, Episode], None] | None = None,
+    on_step: Callable[[TaskStep], None] | None = None,
 ) -> list[Episode]:
     """Drive every layout to its end, `task.num_rows` at a time; results in the order of the layouts.
 
@@ -62,6 +63,7 @@ def run_episodes(
     Args:
         skill: observations (N, D) -> actions (N, A).
         on_episode: called with the index of the layout and the episode, in the order in which they end.
+        on_step: called after every control step, before `on_episode` and before rows that ended start anew.
     """
     if not layouts:
         return []
@@ -83,6 +85,8 @@ def run_episodes(
         earned += step.reward
         collisions += step.collided
         planned += step.option.plan_seconds / task.num_rows
+        if on_step is not None:
+            on_step(step)
         ended = np.flatnonzero((step.terminated | step.truncated) & (current >= 0))
         if not len(ended):
             continue

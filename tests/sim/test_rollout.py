@@ -59,6 +59,13 @@ def test_every_layout_is_driven_once_and_results_are_in_order() -> None:
     assert ended[0][0] == 1 and ended[-1][0] in (3, 6)
 
 
+def test_every_step_is_shown_before_a_row_starts_anew() -> None:
+    layouts = [capped(layout_of(start=(-1.0, -1.0, 0.0)), cap) for cap in (3, 2)]
+    task, seen = make_task(TrainConfig(), 1, worlds=[WORLD]), []
+    run_episodes(task, stand, layouts, on_step=lambda step: seen.append((int(task.steps[0]), bool(step.truncated[0]))))
+    assert seen == [(1, False), (2, False), (3, True), (1, False), (2, True)]
+
+
 @pytest.mark.parametrize("num_rows", [1, 5])
 def test_an_episode_does_not_depend_on_what_runs_beside_it(num_rows: int) -> None:
     layouts = [sample_layout(WORLD, seed) for seed in range(4)]
