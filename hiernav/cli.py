@@ -254,6 +254,7 @@ def _watch(arguments: argparse.Namespace) -> int:
         films = {worlds[0]: out}
     else:
         raise ValueError(f"--out {out} is one film, and there are {len(worlds)} worlds: name a folder")
+    reached: dict[Path, int] = {}
     with _progress() as progress:
         tasks = {world: progress.add_task(str(world), total=arguments.episodes, note="") for world in worlds}
         for world, film in films.items():
@@ -274,8 +275,9 @@ def _watch(arguments: argparse.Namespace) -> int:
                 on_frame=show,
                 on_episode=lambda *_, task=tasks[world]: progress.advance(task),
             )
-            reached = sum(episode.reached for episode in episodes)
-            print(f"{film}: {len(episodes)} episodes, {reached} reached the goal")
+            reached[film] = sum(episode.reached for episode in episodes)
+    for film, count in reached.items():
+        print(f"{film}: {arguments.episodes} episodes, {count} reached the goal")
     return 0
 
 

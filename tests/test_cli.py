@@ -20,7 +20,7 @@ from hiernav import cli
 from hiernav.config import describe_config, load_config
 from hiernav.evaluate import wilson_interval
 
-COMMANDS = ("train", "evaluate", "export", "world", "config")
+COMMANDS = ("train", "evaluate", "watch", "export", "world", "config")
 
 
 @pytest.fixture

@@ -29,8 +29,22 @@ ALLOWED = {
     "evaluate": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
+    "film": {"nav", "sim", "evaluate", "draw"},
     "report": {"nav", "sim", "evaluate", "config", "draw"},
-    "cli": {"nav", "sim", "evaluate", "export", "report", "draw", "config", "decode", "run", "training", "device"},
+    "cli": {
+        "nav",
+        "sim",
+        "evaluate",
+        "export",
+        "report",
+        "draw",
+        "film",
+        "config",
+        "decode",
+        "run",
+        "training",
+        "device",
+    },
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
 TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}
