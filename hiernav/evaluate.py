@@ -166,7 +166,7 @@ def wilson_interval(successes: int, trials: int, z: float = _Z95) -> tuple[float
 
 def _plan_counts(planner: Planner) -> dict[str, int]:
     if isinstance(planner, VerifiedPlanner):
-        return {"proposals": planner.proposals, "repairs": planner.repairs, "refusals": planner.refusals}
+        return {name: getattr(planner, name) for name in ("proposals", "repairs", "loops", "refusals")}
     return {}
 
 

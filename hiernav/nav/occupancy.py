@@ -138,6 +138,14 @@ class VisitMap:
         self.counts = np.zeros_like(self.counts)
         self._last_pixel = None
 
+    def near(self, position: ArrayLike, radius: float) -> bool:
+        """Whether the robot has been in a pixel that meets the square of half-side `radius` [m] around a position."""
+        x, y = np.asarray(position, dtype=np.float64).tolist()
+        first = np.floor((np.array([y, x]) - radius - self.origin[::-1]) / self.resolution).astype(int)
+        last = np.floor((np.array([y, x]) + radius - self.origin[::-1]) / self.resolution).astype(int)
+        (top, left), (bottom, right) = np.maximum(first, 0).tolist(), (last + 1).tolist()
+        return bool(self.counts[top : max(bottom, 0), left : max(right, 0)].any())
+
     def _pixel(self, x: float, y: float) -> tuple[int, int] | None:
         xmin, xmax, ymin, ymax = self._extent
         if not (xmin <= x <= xmax and ymin <= y <= ymax):

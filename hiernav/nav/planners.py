@@ -116,9 +116,11 @@ class GoseloPlanner:
 
 @dataclass
 class VerifiedPlanner:
-    """Sweeps every proposal against the map and replaces the ones that collide by the shortest path.
+    """Checks every proposal and replaces the bad ones by the shortest path.
 
-    Counts proposals, repairs and refusals (a collision where no path exists either; the row is NaN then).
+    A proposal is bad if its sweep meets the map, or if it ends where the robot has been: a network without memory can
+    lead in circles, a shortest path never does. Counts proposals, repairs, loops (the repairs of the second kind) and
+    refusals (no path exists either; the row is NaN then, or the proposal that leads back if it is free).
     """
 
     planner: Planner
@@ -127,6 +129,7 @@ class VerifiedPlanner:
     """Disc that must fit along the plan [m]."""
     proposals: int = 0
     repairs: int = 0
+    loops: int = 0
     refusals: int = 0
 
     def plan(self, query: PlanQuery) -> np.ndarray:
@@ -138,7 +141,12 @@ class VerifiedPlanner:
                 for position, plan, occupancy in zip(query.position, plans, query.occupancy, strict=True)
             ]
         )
-        bad = np.flatnonzero(~(clearance >= self.radius)).tolist()
+        free = clearance >= self.radius
+        back = free & [
+            bool(np.linalg.norm(plan[-1] - goal) > 1e-6) and visits.near(plan[-1], self.radius)
+            for plan, goal, visits in zip(plans, query.goal, query.visits, strict=True)
+        ]
+        bad = np.flatnonzero(~free | back).tolist()
         if bad:
             part = PlanQuery(
                 query.position[bad],
@@ -147,11 +155,13 @@ class VerifiedPlanner:
                 [query.visits[row] for row in bad],
                 query.previous[bad],
             )
+            repaired = self.repair.plan(part)
+            found = np.isfinite(repaired).all(axis=(1, 2))
             plans = plans.copy()
-            plans[bad] = self.repair.plan(part)
-            refused = int(np.isnan(plans[bad]).any(axis=(1, 2)).sum())
-            self.refusals += refused
-            self.repairs += len(bad) - refused
+            plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
+            self.repairs += int(found.sum())
+            self.loops += int((found & back[bad]).sum())
+            self.refusals += int((~found & ~free[bad]).sum())
         return plans
 
 

@@ -172,3 +172,15 @@ def test_visits_are_clipped_and_ignore_what_lies_outside() -> None:
     assert (visits.counts == before).all()
     visits.clear()
     assert not visits.counts.any()
+
+
+def test_visits_are_found_within_a_square_around_a_position() -> None:
+    visits = VisitMap(empty_map((1.0, 1.0)))
+    assert not visits.near((0.0, 0.0), 5.0)
+    visits.add((0.525, 0.025))
+    assert visits.near((0.525, 0.025), 0.0)
+    assert visits.near((0.3, 0.2), 0.25)
+    assert not visits.near((0.3, 0.2), 0.15)
+    assert not visits.near((-0.525, 0.025), 0.3)
+    assert visits.near((1.3, 0.0), 0.9), "a position outside the map, its square reaching in"
+    assert not visits.near((-3.0, -3.0), 0.5)
