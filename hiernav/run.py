@@ -1,8 +1,9 @@
 """Run folders: where a training leaves its configuration, metrics, curves and checkpoints.
 
     config.yaml       every value of the configuration
-    metrics.jsonl     one JSON object per line: stage, step, values
-    tensorboard/      the same as curves
+    metrics.jsonl     one JSON object per line: stage, step, values; the same for the same seed
+    rates.jsonl       how fast the machine was, likewise
+    tensorboard/      both as curves
     planner/, skill/  checkpoints of the two stages
     summary.json      outcome
 
@@ -67,17 +68,12 @@ class Run:
         return cls(path, load_config(path / "config.yaml"))
 
     def log(self, stage: str, step: int, values: Mapping[str, float]) -> None:
-        """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves."""
-        with self._metrics.open("a") as file:
-            known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-            file.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
-        if self._writer is None:
-            from torch.utils.tensorboard import SummaryWriter
+        """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves `stage/...`."""
+        self._append(self._metrics, stage, step, values, stage)
 
-            self._writer = SummaryWriter(str(self.path / "tensorboard"))
-        for key, value in values.items():
-            if math.isfinite(value):
-                self._writer.add_scalar(f"{stage}/{key}", value, step)
+    def log_rates(self, stage: str, step: int, values: Mapping[str, float]) -> None:
+        """Append what depends on the machine to `rates.jsonl` and to the curves `rates/stage/...`."""
+        self._append(self.path / "rates.jsonl", stage, step, values, f"rates/{stage}")
 
     def save(self, stage: str, state: Mapping[str, Any]) -> None:
         """Write a stage's checkpoint atomically: a killed process leaves the previous one."""
@@ -112,6 +108,18 @@ class Run:
         file = self.path / "summary.json"
         known = json.loads(file.read_text()) if file.exists() else {}
         write_atomically(file, (json.dumps({**known, **values}, indent=2) + "\n").encode())
+
+    def _append(self, file: Path, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
+        with file.open("a") as lines:
+            known = {key: value if math.isfinite(value) else None for key, value in values.items()}
+            lines.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
+        if self._writer is None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(self.path / "tensorboard"))
+        for key, value in values.items():
+            if math.isfinite(value):
+                self._writer.add_scalar(f"{curves}/{key}", value, step)
 
     def close(self) -> None:
         if self._writer is not None:

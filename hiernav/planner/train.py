@@ -117,12 +117,15 @@ class PlannerTrainer:
         held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
         began, first, total = time.perf_counter(), self.epoch * planner.samples, planner.epochs * planner.samples
         while not self.finished:
+            started = time.perf_counter()
             loss = self._epoch(samples, lambda done, now: report("training", done, total, first, now))
+            rate = len(samples) / (time.perf_counter() - started)
             self.epoch += 1
             self.validation = {"loss": loss, **self._validate(held_out)}
             if self.finished:
                 self.validation |= self._walk()
             self.run.log("planner", self.epoch, self.validation)
+            self.run.log_rates("planner", self.epoch, {"samples_per_second": rate})
             self._save()
 
     def _epoch(self, samples: Samples, on_batch: Callable[[int, float], None]) -> float:

@@ -53,7 +53,8 @@ class DirectSACLoss(SACLoss):
             next_action, next_log_prob = _sample(self._actor, later)
             value = _values(self._targets, later, next_action).amin(0) - alpha * next_log_prob
             target = following["reward"] + self.value_estimator.gamma * ~following["terminated"] * value
-        errors = _values(self._critics, now, tensordict["action"]) - target
+        values = _values(self._critics, now, tensordict["action"])
+        errors = values - target
         sampled, log_prob = _sample(self._actor, now)
         merit = _values(self._frozen, now, sampled).amin(0)
         surprise = log_prob.detach().mean()
@@ -64,6 +65,8 @@ class DirectSACLoss(SACLoss):
                 "loss_alpha": -self.log_alpha * (surprise + self.target_entropy),
                 "alpha": alpha,
                 "entropy": -surprise,
+                "q_value": values.detach().mean(),
+                "td_error": errors.detach().abs().mean(),
             },
             [],
         )

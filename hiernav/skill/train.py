@@ -175,7 +175,7 @@ class SkillTrainer:
         shutil.rmtree(self.run.path / "skill" / "replay", ignore_errors=True)
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
-        skill, began, first = self.config.skill, time.perf_counter(), self.steps
+        skill, began, first, updates = self.config.skill, time.perf_counter(), self.steps, self.learner.updates
         worlds = [parse_world(text) for text in skill.worlds]
         self.task.draw_from(RandomLayouts(worlds, (self.config.seed, 2, self.steps), self.task.robot.radius))
         frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
@@ -213,8 +213,10 @@ class SkillTrainer:
                     )
         finally:
             collector.shutdown(close_env=False)
-        # rates are not logged with the metrics: these are the same for the same seed
         self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
+        seconds = time.perf_counter() - began
+        rates = {"steps_per_second": self.steps - first, "updates_per_second": self.learner.updates - updates}
+        self.run.log_rates("skill", self.steps, {name: count / seconds for name, count in rates.items()})
 
     def _update(self, frames: int) -> dict[str, float]:
         skill = self.config.skill

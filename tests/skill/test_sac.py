@@ -170,11 +170,19 @@ def test_the_target_bootstraps_through_truncation_and_not_through_termination(
         bootstrap = 0.9 * (torch.minimum(*values) - alpha * log_prob)
         target = following["reward"] + (0.0 if flags.get("terminated") else bootstrap)
         online = source.loss.qvalue_network_params["module"].flatten_keys(".")
-        expected = 0.0
+        estimates = []
         for which, critic in enumerate(unstacked_targets(source)):
             critic.load_state_dict({name: online[name][which] for name in critic.state_dict()})
-            expected += (critic(transitions["observation"], transitions["action"]) - target).square().mean()
-    torch.testing.assert_close(source.loss(transitions)["loss_qvalue"].detach(), expected, rtol=1e-4, atol=1e-5)
+            estimates.append(critic(transitions["observation"], transitions["action"]))
+        errors = torch.stack(estimates) - target
+    out = source.loss(transitions)
+    expected = {
+        "loss_qvalue": errors.square().mean((1, 2)).sum(),
+        "q_value": torch.stack(estimates).mean(),
+        "td_error": errors.abs().mean(),
+    }
+    for name, value in expected.items():
+        torch.testing.assert_close(out[name].detach(), value, rtol=1e-4, atol=1e-5)
 
 
 @norms
