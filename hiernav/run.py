@@ -7,8 +7,8 @@
     planner/, skill/  checkpoints of the two stages
     summary.json      outcome
 
-A checkpoint knows how long `metrics.jsonl` was when it was written; resuming cuts off what came later, so that a
-resumed run leaves the same files as an uninterrupted one.
+A checkpoint knows how long both logs were when it was written; resuming cuts off what came later, so that a resumed
+run leaves the same files as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,11 @@ class RunError(ValueError):
 
 
 class TrainingDiverged(RuntimeError):
-    """Losses are no longer finite; the last checkpoint is from before."""
+    """Losses, weights or physics are no longer finite; the last checkpoint is from before."""
+
+
+_LOGS = {"metrics_length": "metrics.jsonl", "rates_length": "rates.jsonl"}
+"""Key of a checkpoint -> log whose length it holds."""
 
 
 class Run:
@@ -38,7 +44,6 @@ class Run:
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
         self._writer: Any = None
-        self._metrics = path / "metrics.jsonl"
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
@@ -69,57 +74,87 @@ class Run:
 
     def log(self, stage: str, step: int, values: Mapping[str, float]) -> None:
         """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves `stage/...`."""
-        self._append(self._metrics, stage, step, values, stage)
+        self._append("metrics.jsonl", stage, step, values, stage)
 
     def log_rates(self, stage: str, step: int, values: Mapping[str, float]) -> None:
         """Append what depends on the machine to `rates.jsonl` and to the curves `rates/stage/...`."""
-        self._append(self.path / "rates.jsonl", stage, step, values, f"rates/{stage}")
+        self._append("rates.jsonl", stage, step, values, f"rates/{stage}")
 
     def save(self, stage: str, state: Mapping[str, Any]) -> None:
-        """Write a stage's checkpoint atomically: a killed process leaves the previous one."""
+        """Write a stage's checkpoint atomically: a killed process and a full disk leave the previous one.
+
+        Raises:
+            RunError: it cannot be written.
+        """
         import io
 
         import torch
 
-        if self._writer is not None:
-            self._writer.flush()
-        length = self._metrics.stat().st_size if self._metrics.exists() else 0
-        buffer = io.BytesIO()
-        torch.save({**state, "metrics_length": length}, buffer)
-        folder = self.path / stage
-        folder.mkdir(exist_ok=True)
-        write_atomically(folder / "checkpoint.pt", buffer.getvalue())
+        logs = {key: self.path / name for key, name in _LOGS.items()}
+        with self.writing():
+            if self._writer is not None:
+                self._writer.flush()
+            lengths = {key: log.stat().st_size for key, log in logs.items() if log.exists()}
+            buffer = io.BytesIO()
+            torch.save({**state, **lengths}, buffer)
+            folder = self.path / stage
+            folder.mkdir(exist_ok=True)
+            write_atomically(folder / "checkpoint.pt", buffer.getvalue())
 
     def load(self, stage: str, rewind: bool = False) -> dict[str, Any] | None:
-        """A stage's checkpoint, or None; `rewind` cuts off metrics that are newer than every stage's checkpoint.
+        """A stage's checkpoint, or None; `rewind` cuts off logs that are newer than every stage's checkpoint.
 
         Raises:
             RunError: the checkpoint cannot be read.
         """
-        if rewind and self._metrics.exists():
+        if rewind:
             # every stage: the skill's metrics are newer than the planner's checkpoint and must stay
-            known = [_read_checkpoint(file)["metrics_length"] for file in self.path.glob("*/checkpoint.pt")]
-            os.truncate(self._metrics, min(max(known, default=0), self._metrics.stat().st_size))
+            known = [_read_checkpoint(file) for file in self.path.glob("*/checkpoint.pt")]
+            for key, name in _LOGS.items():
+                if (log := self.path / name).exists():
+                    os.truncate(log, min(max((state.get(key, 0) for state in known), default=0), log.stat().st_size))
         file = self.path / stage / "checkpoint.pt"
         return _read_checkpoint(file) if file.exists() else None
+
+    def saved_at(self, stage: str) -> datetime:
+        """Local time at which a stage's checkpoint was written; OSError if there is none."""
+        return datetime.fromtimestamp((self.path / stage / "checkpoint.pt").stat().st_mtime)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Whatever goes wrong inside with writing to the run folder becomes one error that says how to go on.
+
+        Raises:
+            RunError: in the place of an OSError.
+        """
+        try:
+            yield
+        except OSError as error:
+            self._writer = None  # what it still holds cannot be written either
+            raise RunError(
+                f"{self.path} cannot be written to ({error.strerror or error}): checkpoints are as they were; "
+                f"make room, then go on with: hiernav train --resume {self.path}"
+            ) from error
 
     def summarize(self, values: Mapping[str, Any]) -> None:
         """Merge values into `summary.json`."""
         file = self.path / "summary.json"
         known = json.loads(file.read_text()) if file.exists() else {}
-        write_atomically(file, (json.dumps({**known, **values}, indent=2) + "\n").encode())
+        with self.writing():
+            write_atomically(file, (json.dumps({**known, **values}, indent=2) + "\n").encode())
 
-    def _append(self, file: Path, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
-        with file.open("a") as lines:
-            known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-            lines.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
-        if self._writer is None:
-            from torch.utils.tensorboard import SummaryWriter
+    def _append(self, log: str, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
+        known = {key: value if math.isfinite(value) else None for key, value in values.items()}
+        with self.writing():
+            with (self.path / log).open("a") as file:
+                file.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
+            if self._writer is None:
+                from torch.utils.tensorboard import SummaryWriter
 
-            self._writer = SummaryWriter(str(self.path / "tensorboard"))
-        for key, value in values.items():
-            if math.isfinite(value):
-                self._writer.add_scalar(f"{curves}/{key}", value, step)
+                self._writer = SummaryWriter(str(self.path / "tensorboard"))
+            for key, value in known.items():
+                if value is not None:
+                    self._writer.add_scalar(f"{curves}/{key}", value, step)
 
     def close(self) -> None:
         if self._writer is not None:
@@ -153,8 +188,11 @@ def _read_checkpoint(file: Path) -> dict[str, Any]:
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that readers and crashes see the old or the new one, never half of it."""
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

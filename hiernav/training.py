@@ -20,7 +20,8 @@ def train(run: Run, stage: str, progress: Progress) -> None:
     """Train "planner", "skill" or "all" of a run, from its last checkpoints on.
 
     Raises:
-        TrainingDiverged: a loss is not finite.
+        TrainingDiverged: a loss, a weight or the physics is not finite.
+        RunError: the run folder cannot be written to.
     """
     torch.set_num_threads(run.config.threads)
     if run.config.skill.preset == "baseline":
@@ -30,7 +31,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
     planner = planner_train.PlannerTrainer(run.config, run)
     done = planner.resume()
     if done is not None and not planner.finished:
-        progress.console.print(f"planner: going on after epoch {done} of {run.config.planner.epochs}")
+        _say_resumed(progress, run, "planner", f"epoch {done} of {run.config.planner.epochs}")
     if stage in ("planner", "all") and not planner.finished:
         began = time.perf_counter()
         planner.train(_PlannerDisplay(progress))
@@ -48,11 +49,18 @@ def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
     skill = skill_train.SkillTrainer(run.config, run, guide)
     steps = skill.resume()
     if steps is not None and not skill.finished:
-        progress.console.print(f"skill: going on after step {steps:,} of {run.config.skill.total_steps:,}")
+        _say_resumed(progress, run, "skill", f"step {steps:,} of {run.config.skill.total_steps:,}")
     began = time.perf_counter()
     skill.train(_SkillDisplay(progress))
     best = max(skill.evaluations, key=skill_train.merit)
     run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
+
+
+def _say_resumed(progress: Progress, run: Run, stage: str, done: str) -> None:
+    when = run.saved_at(stage).strftime("%Y-%m-%d %H:%M:%S")
+    progress.console.print(
+        f"{stage}: going on after {done}, from the checkpoint of {when}", soft_wrap=True, highlight=False
+    )
 
 
 class _Display:

@@ -72,7 +72,7 @@ def test_a_file_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(OSError, match="power cut"):
         patch.setattr(run_module.os, "replace", fail)
         write_atomically(file, b"new and longer")
-    assert file.read_bytes() == b"old"
+    assert file.read_bytes() == b"old" and os.listdir(tmp_path) == ["checkpoint.pt"]
     assert synced == [b"new and longer"]  # complete, on disk, before it takes the old one's place
     write_atomically(file, b"newest")
     assert file.read_bytes() == b"newest"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from hiernav.nav import goselo
 from hiernav.nav.planners import GoseloPlanner
 from hiernav.planner.dataset import LabelSettings, Samples, make_samples
 from hiernav.planner.network import HypothesisNetwork, PaperNetwork, TorchNetwork, make_network
-from hiernav.run import Run
+from hiernav.run import Run, TrainingDiverged
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.walk import walk
@@ -95,7 +96,12 @@ class PlannerTrainer:
         return self.epoch >= self.config.planner.epochs
 
     def train(self, on_progress: Callable[[Progress], None] | None = None) -> None:
-        """Make the data set, train all epochs, and measure collisions of the waypoints."""
+        """Make the data set, train all epochs, and measure collisions of the waypoints.
+
+        Raises:
+            TrainingDiverged: the loss or the network is not finite.
+            RunError: the run folder cannot be written to.
+        """
         if self.finished:
             return
         planner, seed = self.config.planner, self.config.seed
@@ -138,16 +144,29 @@ class PlannerTrainer:
             if planner.mirror:
                 batch = _mirror(batch, (torch.rand(len(rows)) < 0.5).to(self.device))
             loss = plan_loss(self.network, batch, self._margin, planner.clearance_weight)
+            value = float(loss.detach())
+            if not math.isfinite(value):  # never to be sent back: grid_sample crashes on waypoints that are NaN
+                raise self._diverged(f"loss not finite in batch {first // planner.batch_size + 1}")
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
             self.optimizer.step()
             self.schedule.step()
-            total += float(loss.detach()) * len(rows)
+            total += value * len(rows)
             if time.perf_counter() - began > 0.2:
                 began = time.perf_counter()
                 on_batch(self.epoch * len(order) + first, total / (first + len(rows)))
+        if not all(bool(weight.isfinite().all()) for weight in self.network.parameters()):
+            raise self._diverged("weights not finite at the end")
         return total / len(order)
+
+    def _diverged(self, what: str) -> TrainingDiverged:
+        path = self.run.path
+        kept = f"the last checkpoint is of epoch {self.epoch}" if self.epoch else "there is no checkpoint yet"
+        return TrainingDiverged(
+            f"{what} of epoch {self.epoch + 1}, and {kept}: `hiernav train --resume {path}` repeats it, with another "
+            f"seed in {path / 'config.yaml'} other samples follow"
+        )
 
     @property
     def _margin(self) -> float:

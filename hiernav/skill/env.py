@@ -15,12 +15,19 @@ from hiernav.sim.reward import TERMS
 from hiernav.sim.task import NavigationTask
 
 
+class PhysicsDiverged(RuntimeError):
+    """The physics of a simulation is no longer finite; says which episode it was."""
+
+
 class NavigationEnv(EnvBase):
     """N robots following plans; batch size (N,).
 
     Beside `observation`, `reward`, `done`, `terminated` and `truncated` a step holds, for logging: `terms` (N, 6)
     unweighted reward terms in the order of `TERMS`, `reason` (N, 1) why the option ended, `reached` and `collided`
     (N, 1), and `episode_steps` (N, 1).
+
+    A step raises `PhysicsDiverged` if a simulation's physics is no longer finite afterwards: nothing is to be learnt
+    from a broken robot.
     """
 
     def __init__(self, task: NavigationTask, device: str = "cpu") -> None:
@@ -65,6 +72,8 @@ class NavigationEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         step = self.task.step(tensordict["action"].detach().cpu().numpy())
+        if step.broken.any():
+            raise PhysicsDiverged(self._broken_episode(int(np.flatnonzero(step.broken)[0])))
 
         def column(values: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
             return torch.as_tensor(values, dtype=dtype).unsqueeze(-1)
@@ -84,6 +93,14 @@ class NavigationEnv(EnvBase):
             },
             self.batch_size,
             device=self.device,
+        )
+
+    def _broken_episode(self, row: int) -> str:
+        layout, radius = self.task.layouts[row], self.task.robot.radius
+        return (
+            f"the physics of simulation {row} is not finite after step {self.task.steps[row]} of an episode in world "
+            f"{layout.spec}, seed {layout.seed} (see it with: hiernav world --kind '{layout.spec}' "
+            f"--seed {layout.seed} --radius {radius:g} --png world.png)"
         )
 
     def _set_seed(self, seed: int | None) -> None:

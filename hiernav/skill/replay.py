@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 import torch
@@ -19,6 +21,8 @@ class Replay:
     Entries before the cursor of a checkpoint are on disk when it is written. What a crashed run wrote after it is
     overwritten by the resumed one. (Once the buffer has wrapped, such entries can be sampled before they are
     overwritten; a run is only reproduced to the bit while `total_steps <= buffer_size`.)
+
+    Raises OSError if the disk has no room for `size` transitions.
     """
 
     def __init__(self, folder: Path, size: int, observation: int, action: int, batch_size: int) -> None:
@@ -39,6 +43,7 @@ class Replay:
                 }
             )
             self._data = example.expand(size).memmap_like(folder)
+            _reserve(folder)
         self._storage = TensorStorage(self._data)
         self._buffer = ReplayBuffer(storage=self._storage, batch_size=batch_size)
         self._set(0, 0)
@@ -64,6 +69,23 @@ class Replay:
         # the files are the storage: only how much of them is valid has to be told
         self._storage._len = length
         self._buffer.writer.load_state_dict({"_cursor": cursor, "_write_count": length})
+
+
+def _reserve(folder: Path) -> None:
+    """Have the disk set the space of the files aside now: a page for which there is none left kills the process.
+
+    Raises:
+        OSError: there is not enough; the folder is removed.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        for file in folder.rglob("*.memmap"):
+            with file.open("r+b") as opened:
+                os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
+    except OSError:
+        shutil.rmtree(folder)
+        raise
 
 
 def mirror_half(batch: TensorDict, mirror: Mirror) -> None:

@@ -133,6 +133,11 @@ class Learner:
         self.updates += 1
         return {key: value.detach() for key, value in out.items()}
 
+    @property
+    def finite(self) -> bool:
+        """Whether all weights and the temperature are."""
+        return all(bool(weight.isfinite().all()) for weight in self._weights)
+
     def publish(self) -> None:
         """Let the acting policy have the weights learnt so far; where it is the one that learns, it has them."""
         if self._learning is not self.actor:

@@ -28,7 +28,7 @@ from hiernav.sim.reward import TERMS
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import run_episodes
 from hiernav.sim.worlds import sample_layout
-from hiernav.skill.env import NavigationEnv
+from hiernav.skill.env import NavigationEnv, PhysicsDiverged
 from hiernav.skill.networks import Actor
 from hiernav.skill.replay import Replay, mirror_half
 from hiernav.skill.sac import Learner, PartlyGreedy, SacSettings
@@ -124,18 +124,20 @@ class SkillTrainer:
         self.learner = make_learner(config)
         self.task = make_task(config, skill.num_envs, planner, end_on_fall=skill.end_on_fall)
         self.env = NavigationEnv(self.task)
-        self.replay = Replay(
-            run.path / "skill" / "replay",
-            min(skill.buffer_size, skill.total_steps + skill.num_envs),
-            self.task.layout.size,
-            self.task.robot.action_dim,
-            skill.batch_size,
-        )
+        with run.writing():
+            self.replay = Replay(
+                run.path / "skill" / "replay",
+                min(skill.buffer_size, skill.total_steps + skill.num_envs),
+                self.task.layout.size,
+                self.task.robot.action_dim,
+                skill.batch_size,
+            )
         self._mirror = mirror_of(config.robot, self.task.layout) if skill.mirror else None
         self.steps = 0
         self.evaluations: list[dict[str, float]] = []
         self.best_actor: dict[str, torch.Tensor] | None = None
         self._due = 0.0
+        self._saved: int | None = None
         self._episodes = _Episodes()
 
     def resume(self) -> int | None:
@@ -147,6 +149,7 @@ class SkillTrainer:
         self.replay.load_state_dict(state["replay"])
         restore_random_state(state, self.learner.device)
         self.steps, self._due = state["steps"], state["due"]
+        self._saved = self.steps
         self.evaluations, self.best_actor = state["evaluations"], state["best_actor"]
         self._episodes.reached.extend(state["reached"])
         self._episodes.steps.extend(state["episode_steps"])
@@ -165,7 +168,8 @@ class SkillTrainer:
         """Train to the end, checkpointing on the way.
 
         Raises:
-            TrainingDiverged: a loss is not finite.
+            TrainingDiverged: a loss, a weight or the physics is not finite.
+            RunError: the run folder cannot be written to.
         """
         while not self.finished:
             self._segment(on_progress)
@@ -211,6 +215,8 @@ class SkillTrainer:
                             evaluation,
                         )  # fmt: skip
                     )
+        except PhysicsDiverged as error:
+            raise self._diverged(str(error)) from error
         finally:
             collector.shutdown(close_env=False)
         self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
@@ -231,12 +237,21 @@ class SkillTrainer:
         self.learner.publish()
         values = {key: float(value) for key, value in metrics.items()}
         broken = [key for key, value in values.items() if not np.isfinite(value)]
+        if not self.learner.finite:  # the last update of all can break them without a trace in its losses
+            broken.append("weights")
         if broken:
-            raise TrainingDiverged(
-                f"{', '.join(broken)} not finite after {self.learner.updates} updates; "
-                f"the last checkpoint in {self.run.path} is from before"
-            )
+            raise self._diverged(f"{', '.join(broken)} not finite after {self.learner.updates} updates")
         return values
+
+    def _diverged(self, what: str) -> TrainingDiverged:
+        path = self.run.path
+        kept = (
+            "there is no checkpoint yet" if self._saved is None else f"the last checkpoint is of step {self._saved:,}"
+        )
+        return TrainingDiverged(
+            f"{what}; this was at step {self.steps:,} of training, and {kept}: `hiernav train --resume {path}` repeats "
+            f"it, with another seed in {path / 'config.yaml'} other worlds follow"
+        )
 
     def _batch(self) -> TensorDict:
         batch = self.replay.sample()
@@ -298,6 +313,7 @@ class SkillTrainer:
                 "episode_steps": list(self._episodes.steps),
             },
         )
+        self._saved = self.steps
 
 
 def load_actor(config: TrainConfig, state: dict) -> Actor:

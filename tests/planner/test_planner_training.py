@@ -16,7 +16,7 @@ from hiernav.nav import goselo  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
 from hiernav.planner.train import PlannerTrainer, clearance_at, load_network, plan_loss  # noqa: E402
-from hiernav.run import Run  # noqa: E402
+from hiernav.run import Run, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
 
@@ -95,6 +95,27 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, monkeypa
     assert weights.keys() == again.keys()
     assert all(torch.equal(weights[key], again[key]) for key in weights)
     assert (run.path / "metrics.jsonl").read_bytes() == (straight.run.path / "metrics.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("part", "named"), [("loss", "loss not finite in batch 2"), ("weights", "weights not finite at the end")]
+)
+def test_what_is_not_finite_stops_training_before_it_reaches_the_checkpoint(tmp_path, monkeypatch, part, named):
+    trainer, batches = trainer_in(tmp_path / "run", "planner.epochs=3"), []
+
+    def broken(*arguments):
+        batches.append(0)
+        loss = plan_loss(*arguments)
+        if len(batches) == 6 and part == "weights":  # the last of the second epoch: no loss comes after it
+            trainer.optimizer.register_step_post_hook(lambda *_: next(trainer.network.parameters()).data.fill_(np.nan))
+        return loss * np.nan if len(batches) == 5 and part == "loss" else loss
+
+    monkeypatch.setattr(planner_train, "plan_loss", broken)
+    with pytest.raises(TrainingDiverged, match=f"^{named} of epoch 2, .* checkpoint is of epoch 1: .* --resume"):
+        trainer.train()
+    state = trainer.run.load("planner")
+    assert state["epoch"] == 1
+    assert all(value.isfinite().all() for value in state["network"].values() if value.is_floating_point())
 
 
 def test_a_finished_planner_is_not_trained_again(tmp_path, monkeypatch):

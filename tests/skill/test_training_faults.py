@@ -1,0 +1,213 @@
+"""Claims about training that goes wrong: it stops with one line that says what to do, and loses one segment at most."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_run
+
+torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
+pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
+
+from hiernav import cli  # noqa: E402
+from hiernav.run import Run, RunError, TrainingDiverged  # noqa: E402
+from hiernav.sim.layout import Layout, parse_world  # noqa: E402
+from hiernav.sim.worlds import sample_layout  # noqa: E402
+from hiernav.skill import replay as replay_module  # noqa: E402
+from hiernav.skill.train import SkillTrainer  # noqa: E402
+
+pytestmark = pytest.mark.train
+
+
+@pytest.fixture
+def at_step(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, Callable[[SkillTrainer], None]], None]:
+    """Has something happen once to a trainer that has collected so many steps, before it learns from them."""
+
+    def arrange(steps: int, act: Callable[[SkillTrainer], None]) -> None:
+        update, done = SkillTrainer._update, []
+
+        def hooked(trainer: SkillTrainer, frames: int) -> dict[str, float]:
+            if trainer.steps >= steps and not done:
+                done.append(steps)
+                act(trainer)
+            return update(trainer, frames)
+
+        monkeypatch.setattr(SkillTrainer, "_update", hooked)
+
+    return arrange
+
+
+@pytest.fixture
+def trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Runs `hiernav train` on a tiny skill; returns the exit code and what it said last on stderr."""
+
+    def run(*arguments: str) -> tuple[int, str]:
+        capsys.readouterr()
+        code = cli.main(["train", "--stage", "skill", *(arguments or tiny_run.arguments(tmp_path / "run"))])
+        return code, capsys.readouterr().err.rstrip().splitlines()[-1]
+
+    return run
+
+
+def skill_lines(folder: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["stage"] != "planner"]
+
+
+def checkpoint_steps(folder: Path) -> int:
+    return Run.open(folder).load("skill")["steps"]
+
+
+def test_physics_that_breaks_stops_training_and_names_the_episode(trained, at_step, tmp_path):
+    layouts: list[Layout] = []
+
+    def break_simulation(trainer: SkillTrainer) -> None:
+        layouts.append(trainer.task.layouts[3])
+        trainer.task.sim.datas[3].qvel[0] = np.nan
+
+    at_step(384, break_simulation)
+    code, line = trained()
+    assert code == 1 and line.startswith("hiernav train: the physics of simulation 3 is not finite after step ")
+    assert "at step 384 of training, and the last checkpoint is of step 256" in line
+    # what it prints draws the very world it happened in
+    named = re.search(r"hiernav world --kind '(\S+)' --seed (\d+) --radius (\S+) --png", line)
+    drawn = sample_layout(parse_world(named[1]), int(named[2]), float(named[3]))
+    np.testing.assert_array_equal(drawn.pillars, layouts[0].pillars)
+    np.testing.assert_array_equal(drawn.start, layouts[0].start)
+    assert checkpoint_steps(tmp_path / "run") == 256
+    assert trained("--resume", str(tmp_path / "run"))[0] == 0
+    assert checkpoint_steps(tmp_path / "run") == 768
+
+
+def test_weights_that_break_in_the_last_update_of_a_segment_do_not_reach_the_checkpoint(tmp_path):
+    run = Run.create(tiny_run.config(tmp_path / "run"))
+    trainer = SkillTrainer(run.config, run)
+    update = trainer.learner.update
+
+    def broken_gradient(batch):
+        metrics = update(batch)
+        if trainer.learner.updates == 25:  # the last one before step 512; its losses are from before the step
+            with torch.no_grad():
+                trainer.learner.actor.head.weight.fill_(torch.nan)
+        return metrics
+
+    trainer.learner.update = broken_gradient
+    with pytest.raises(TrainingDiverged, match=r"^weights not finite after 25 updates; .* step 512 .* of step 256"):
+        trainer.train()
+    state = run.load("skill")
+    assert state["steps"] == 256
+    assert all(value.isfinite().all() for value in state["learner"]["loss"].values() if torch.is_tensor(value))
+
+
+def test_training_that_breaks_before_the_first_checkpoint_says_that_there_is_none(tmp_path):
+    run = Run.create(tiny_run.config(tmp_path / "run", "skill.learning_starts=64"))
+    trainer = SkillTrainer(run.config, run)
+    with torch.no_grad():
+        trainer.learner.loss.log_alpha.fill_(torch.nan)
+    with pytest.raises(TrainingDiverged, match="alpha.*not finite.*there is no checkpoint yet"):
+        trainer.train()
+
+
+@pytest.fixture
+def limit_files() -> Iterator[Callable[[int], None]]:
+    """Makes writing a file longer than so many bytes fail, as on a full disk, until the test ends."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("size", [20_000, 1_000], ids=["checkpoint does not fit", "log does not fit"])
+def test_a_full_disk_ends_training_in_one_line_and_leaves_the_last_checkpoint(
+    trained, at_step, limit_files, tmp_path, size
+):
+    at_step(384, lambda _: limit_files(size))
+    code, line = trained()
+    limit_files(resource.RLIM_INFINITY)
+    run = tmp_path / "run"
+    assert code == 2
+    assert line == (
+        f"hiernav train: {run} cannot be written to (File too large): checkpoints are as they were; "
+        f"make room, then go on with: hiernav train --resume {run}"
+    )
+    assert checkpoint_steps(run) == 256 and not list(run.rglob("*.part"))
+    assert trained("--resume", str(run))[0] == 0
+    assert [line["step"] for line in skill_lines(run) if line["stage"] == "skill"] == [256, 512, 768]
+    rates = [json.loads(line)["step"] for line in (run / "rates.jsonl").read_text().splitlines()]
+    assert rates == [256, 512, 768]
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="this system cannot set space aside")
+def test_the_replay_takes_its_place_on_disk_before_training_begins(tmp_path):
+    replay = replay_module.Replay(tmp_path / "replay", 5_000, 42, 2, 8)
+    files = list((tmp_path / "replay").rglob("*.memmap"))
+    assert len(files) == 6 and len(replay) == 0
+    assert all(file.stat().st_blocks * 512 >= file.stat().st_size for file in files)
+
+
+def test_a_disk_without_room_for_the_replay_is_reported_at_once(tmp_path, monkeypatch):
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(replay_module.os, "posix_fallocate", full, raising=False)
+    run = Run.create(tiny_run.config(tmp_path / "run"))
+    with pytest.raises(RunError, match="cannot be written to .No space left on device.* make room"):
+        SkillTrainer(run.config, run)
+    assert not (run.path / "skill" / "replay").exists()
+
+
+KILLED_IN_A_SEGMENT = """
+update = train.SkillTrainer._update
+def _update(self, frames):
+    if self.steps > 256:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return update(self, frames)
+train.SkillTrainer._update = _update
+"""
+KILLED_HALFWAY_THROUGH_A_CHECKPOINT = """
+fsync, written = os.fsync, []
+def _fsync(file):
+    written.append(os.readlink(f"/proc/self/fd/{file}"))
+    if sum(name.endswith("skill/checkpoint.pt.part") for name in written) == 2:
+        os.ftruncate(file, os.fstat(file).st_size // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+    fsync(file)
+os.fsync = _fsync
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
+@pytest.mark.parametrize("how", [KILLED_IN_A_SEGMENT, KILLED_HALFWAY_THROUGH_A_CHECKPOINT], ids=["segment", "save"])
+def test_a_killed_run_goes_on_from_its_last_checkpoint_as_if_nothing_had_happened(tmp_path, trained_run, capsys, how):
+    run = tmp_path / "run"
+    code = f"""
+import os, signal, sys
+from hiernav import cli
+from hiernav.skill import train
+{how}
+cli.main({["train", "--stage", "skill", *tiny_run.arguments(run)]!r})
+"""
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert (run / "skill" / "checkpoint.pt.part").exists() == (how is KILLED_HALFWAY_THROUGH_A_CHECKPOINT)
+    saved = (run / "skill" / "checkpoint.pt").stat().st_mtime
+    assert checkpoint_steps(run) == 256
+
+    assert cli.main(["train", "--stage", "skill", "--resume", str(run)]) == 0
+    said = re.search(
+        r"skill: going on after step 256 of 768, from the checkpoint of (\S+ \S+)\n", capsys.readouterr().err
+    )
+    assert said and said[1] == datetime.fromtimestamp(saved).strftime("%Y-%m-%d %H:%M:%S")
+    assert skill_lines(run) == skill_lines(trained_run)
+    assert not list(run.rglob("*.part"))
