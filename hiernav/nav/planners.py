@@ -118,8 +118,8 @@ class GoseloPlanner:
 class VerifiedPlanner:
     """Checks every proposal and replaces the bad ones by the shortest path.
 
-    A proposal is bad if its sweep meets the map, or if it ends where the robot has been: a network without memory can
-    lead in circles, a shortest path never does. Counts proposals, repairs, loops (the repairs of the second kind) and
+    A proposal is bad if its sweep meets the map, or if its second half leads where the robot has been: a network
+    without memory can lead to and fro between two ways, a shortest path never does. Counts proposals, repairs, loops (the repairs of the second kind) and
     refusals (no path exists either; the row is NaN then, or the proposal that leads back if it is free).
     """
 
@@ -143,8 +143,8 @@ class VerifiedPlanner:
         )
         free = clearance >= self.radius
         back = free & [
-            bool(np.linalg.norm(plan[-1] - goal) > 1e-6) and visits.near(plan[-1], self.radius)
-            for plan, goal, visits in zip(plans, query.goal, query.visits, strict=True)
+            any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])
+            for plan, visits in zip(plans, query.visits, strict=True)
         ]
         bad = np.flatnonzero(~free | back).tolist()
         if bad:
