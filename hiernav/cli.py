@@ -1,6 +1,7 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
-Exit codes: 0 done; 1 training diverged; 2 bad input, with one line that says what to do; 130 interrupted.
+Exit codes: 0 done; 1 training diverged or lost its workers; 2 bad input, with one line that says what to do;
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hiernav.run import TrainingDiverged
+from hiernav.run import TrainingDiverged, WorkersLost
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -36,14 +37,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
-    except TrainingDiverged as error:
+    except (TrainingDiverged, WorkersLost) as error:
         print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return FAILED
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("hiernav"):
             raise
+        extra = "ray" if error.name == "ray" else "train"
         print(
-            f"hiernav {arguments.command}: needs {error.name}: install it with `pip install 'hiernav[train]'`",
+            f"hiernav {arguments.command}: needs {error.name}: install it with `pip install 'hiernav[{extra}]'`",
             file=sys.stderr,
         )
         return BAD_INPUT
@@ -68,6 +70,13 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--config", metavar="FILE", help="YAML with what differs from the defaults")
     train.add_argument("--resume", metavar="RUN", help="go on with this run folder from its last checkpoints")
     train.add_argument("--stage", choices=("planner", "skill", "all"), default="all", help="what to train (all)")
+    train.add_argument(
+        "--collector",
+        choices=("local", "multi", "ray"),
+        help="who simulates: this process, several, or a Ray cluster (skill.collector)",
+    )
+    train.add_argument("--workers", metavar="N", help="processes that simulate, for multi and ray (skill.workers)")
+    train.add_argument("--ray-address", metavar="ADDRESS", help="Ray cluster to join (skill.ray_address)")
     train.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
     train.set_defaults(run=_train)
 
@@ -161,12 +170,18 @@ def _train(arguments: argparse.Namespace) -> int:
     from hiernav.config import load_config
     from hiernav.run import Run, RunError
 
+    flags = {"skill.collector": arguments.collector, "skill.workers": arguments.workers}
+    flags["skill.ray_address"] = arguments.ray_address
+    overrides = [f"{key}={value}" for key, value in flags.items() if value is not None] + arguments.overrides
     if arguments.resume:
-        if arguments.config or arguments.overrides:
-            raise RunError("--resume takes its configuration from the run folder: leave out --config and KEY=VALUE")
+        if arguments.config or overrides:
+            raise RunError(
+                "--resume takes its configuration from the run folder: leave out --config and KEY=VALUE, "
+                "also as --collector, --workers or --ray-address"
+            )
         run = Run.open(arguments.resume)
     else:
-        config = load_config(arguments.config, arguments.overrides)
+        config = load_config(arguments.config, overrides)
         _check_worlds(config)
         _check_machine(config)
         run = Run.create(config)
@@ -359,12 +374,15 @@ def _check_worlds(config: TrainConfig) -> None:
 def _check_machine(config: TrainConfig) -> None:
     """Fail before a run folder is made when what the training needs is not installed, or there is no such device."""
     import tensorboard  # noqa: F401
+    import torch  # noqa: F401
     import torchrl  # noqa: F401
 
     from hiernav.device import choose_device
 
     choose_device(config.planner.device, "planner.device")
     choose_device(config.skill.device, "skill.device")
+    if config.skill.collector == "ray":
+        import ray  # noqa: F401
 
 
 def _print_results(results: dict[str, dict[str, Any]]) -> None:

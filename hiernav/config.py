@@ -72,6 +72,20 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Literal["astar", "cnn"], Meta(description="Who plans in training: exact search or the trained network.")
     ] = "astar"
     num_envs: Annotated[int, Meta(ge=1, le=65_536, description="Simulations stepped together.")] = 32
+    collector: Annotated[
+        Literal["local", "multi", "ray"],
+        Meta(description="Who simulates: this process, `workers` processes of this machine, or of a Ray cluster."),
+    ] = "local"
+    workers: Annotated[
+        int, Meta(ge=1, le=1024, description="Processes of collector multi or ray, of `num_envs` simulations each.")
+    ] = 2
+    overlap: Annotated[
+        bool, Meta(description="Let workers go on during updates: they act by weights that are one batch older.")
+    ] = False
+    ray_address: Annotated[
+        Annotated[str, Meta(min_length=1)] | None,
+        Meta(description="Cluster of collector ray; null: $RAY_ADDRESS, one that runs here, or a new one here."),
+    ] = None
     total_steps: Annotated[int, Meta(ge=1, description="Control steps in all, summed over simulations.")] = 200_000
     learning_starts: Annotated[int, Meta(ge=0, description="Steps with random actions before the first update.")] = (
         2_000
@@ -263,6 +277,8 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
             f"{source}: skill.learning_starts = {skill.learning_starts}, "
             f"expected < skill.total_steps = {skill.total_steps}"
         )
+    if skill.overlap and skill.collector == "local":
+        raise ConfigError(f"{source}: skill.overlap = true, expected with skill.collector = 'multi' or 'ray' only")
     if skill.preset == "baseline" and (reward.path_distance or reward.progress):
         raise ConfigError(
             f"{source}: reward.path_distance = {reward.path_distance} and reward.progress = {reward.progress}, "

@@ -38,6 +38,10 @@ _LOGS = {"metrics_length": "metrics.jsonl", "rates_length": "rates.jsonl"}
 """Key of a checkpoint -> log whose length it holds."""
 
 
+class WorkersLost(RuntimeError):
+    """The workers that simulate die whenever they are started; the last checkpoint is from before."""
+
+
 class Run:
     """One run folder, open for training."""
 

@@ -15,6 +15,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
 
+from hiernav.config import SkillConfig
 from hiernav.nav.observation import ObservationLayout
 from hiernav.skill.loss import DirectSACLoss
 from hiernav.skill.networks import Actor, Critic
@@ -64,6 +65,11 @@ class PartlyGreedy(TensorDictModuleBase):
         greedy = round(self.share * len(tensordict))
         action = torch.cat([torch.tanh(tensordict["loc"][:greedy]), tensordict["action"][greedy:]])
         return tensordict.set("action", action)
+
+
+def exploring(policy: ProbabilisticActor, skill: SkillConfig) -> TensorDictModuleBase:
+    """What acts in training, with the weights of `policy`; a new one for every segment."""
+    return PartlyGreedy(policy, skill.greedy_share)
 
 
 def choose_precision(name: str, device: torch.device) -> torch.dtype:

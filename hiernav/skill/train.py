@@ -1,4 +1,4 @@
-"""Training of the skill: torchrl's collector, a replay buffer on disk, and the learner.
+"""Training of the skill: batches from torchrl's collectors, a replay buffer on disk, and the learner.
 
 The run is cut into segments of `checkpoint_every_steps`. Each one starts from freshly drawn episodes and ends with a
 checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved.
@@ -10,34 +10,33 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 
 from hiernav.config import SkillConfig, TrainConfig
 from hiernav.device import choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.run import Run, RunError, TrainingDiverged
-from hiernav.sim.factory import RandomLayouts, make_task, skill_layout
+from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.layout import parse_world
 from hiernav.sim.reward import TERMS
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import run_episodes
 from hiernav.sim.worlds import sample_layout
-from hiernav.skill.env import NavigationEnv, PhysicsDiverged
+from hiernav.skill.collect import make_batches
+from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.networks import Actor
 from hiernav.skill.replay import Replay, mirror_half
-from hiernav.skill.sac import Learner, PartlyGreedy, SacSettings
+from hiernav.skill.sac import Learner, SacSettings
 
 _WINDOW = 200
 """Episodes that running means are taken over."""
 _EVALUATION_SEED = 0xE7A1
-_BATCH_FRAMES = 128
-"""Steps collected between two bursts of updates, at least one per simulation."""
 _LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
 
 
@@ -122,17 +121,17 @@ class SkillTrainer:
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
         torch.manual_seed(int(seeds[0]))
         self.learner = make_learner(config)
-        self.task = make_task(config, skill.num_envs, planner, end_on_fall=skill.end_on_fall)
-        self.env = NavigationEnv(self.task)
+        self.batches = make_batches(config, self.learner.policy, planner)
+        layout, self._robot = skill_layout(config), get_robot(config.robot)
         with run.writing():
             self.replay = Replay(
                 run.path / "skill" / "replay",
-                min(skill.buffer_size, skill.total_steps + skill.num_envs),
-                self.task.layout.size,
-                self.task.robot.action_dim,
+                min(skill.buffer_size, skill.total_steps + self.batches.frames),
+                layout.size,
+                self._robot.action_dim,
                 skill.batch_size,
             )
-        self._mirror = mirror_of(config.robot, self.task.layout) if skill.mirror else None
+        self._mirror = mirror_of(config.robot, layout) if skill.mirror else None
         self.steps = 0
         self.evaluations: list[dict[str, float]] = []
         self.best_actor: dict[str, torch.Tensor] | None = None
@@ -169,60 +168,49 @@ class SkillTrainer:
 
         Raises:
             TrainingDiverged: a loss, a weight or the physics is not finite.
+            WorkersLost: the workers that simulate cannot be kept alive.
             RunError: the run folder cannot be written to.
         """
-        while not self.finished:
-            self._segment(on_progress)
-            if self.steps >= self._next_evaluation() or self.steps >= self.config.skill.total_steps:
-                self._evaluate()
-            self._save()
+        with closing(self.batches):
+            while not self.finished:
+                self._segment(on_progress)
+                if self.steps >= self._next_evaluation() or self.steps >= self.config.skill.total_steps:
+                    self._evaluate()
+                self._save()
         shutil.rmtree(self.run.path / "skill" / "replay", ignore_errors=True)
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
         skill, began, first, updates = self.config.skill, time.perf_counter(), self.steps, self.learner.updates
-        worlds = [parse_world(text) for text in skill.worlds]
-        self.task.draw_from(RandomLayouts(worlds, (self.config.seed, 2, self.steps), self.task.robot.radius))
         frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
-        per_batch = skill.num_envs * max(1, min(_BATCH_FRAMES // skill.num_envs, frames // skill.num_envs))
-        collector = Collector(
-            self.env,
-            PartlyGreedy(self.learner.policy, skill.greedy_share),
-            frames_per_batch=per_batch,
-            total_frames=max(1, frames // per_batch) * per_batch,
-            init_random_frames=-(-max(0, skill.learning_starts - self.steps) // per_batch) * per_batch,
-            auto_register_policy_transforms=False,
-        )
         window: list[TensorDict] = []
         try:
-            for data in collector:
-                data = data.reshape(-1)
-                data["next", "reward"] *= skill.reward_scale
-                self._episodes.add(data)
-                window.append(data.select(*_LOGGED))
-                self.replay.extend(data)
-                self.steps += len(data)
-                metrics = self._update(len(data))
-                if on_progress is not None:
-                    rate = (self.steps - first) / (time.perf_counter() - began)
-                    evaluation = self.evaluations[-1]["reach_rate"] if self.evaluations else None
-                    on_progress(
-                        Progress(
-                            self.steps,
-                            skill.total_steps,
-                            self.learner.updates,
-                            rate,
-                            self._episodes.reach_rate,
-                            evaluation,
-                        )  # fmt: skip
-                    )
+            with closing(self.batches.segment(self.steps, frames)) as batches:
+                for data in batches:
+                    data["next", "reward"] *= skill.reward_scale
+                    self._episodes.add(data)
+                    window.append(data.select(*_LOGGED))
+                    self.replay.extend(data)
+                    self.steps += len(data)
+                    metrics = self._update(len(data))
+                    if on_progress is not None:
+                        on_progress(self._progress((self.steps - first) / (time.perf_counter() - began)))
         except PhysicsDiverged as error:
             raise self._diverged(str(error)) from error
-        finally:
-            collector.shutdown(close_env=False)
         self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
         seconds = time.perf_counter() - began
         rates = {"steps_per_second": self.steps - first, "updates_per_second": self.learner.updates - updates}
         self.run.log_rates("skill", self.steps, {name: count / seconds for name, count in rates.items()})
+
+    def _progress(self, rate: float) -> Progress:
+        evaluation = self.evaluations[-1]["reach_rate"] if self.evaluations else None
+        return Progress(
+            steps=self.steps,
+            total_steps=self.config.skill.total_steps,
+            updates=self.learner.updates,
+            steps_per_second=rate,
+            reach_rate=self._episodes.reach_rate,
+            evaluation=evaluation,
+        )
 
     def _update(self, frames: int) -> dict[str, float]:
         skill = self.config.skill
@@ -279,7 +267,7 @@ class SkillTrainer:
     def _evaluate(self) -> None:
         """Reach rate of the deterministic policy on worlds that are never trained on; keeps the best actor."""
         skill = self.config.skill
-        radius = self.task.robot.radius
+        radius = self._robot.radius
         seeds = np.random.SeedSequence((self.config.seed, _EVALUATION_SEED)).generate_state(skill.eval_episodes)
         worlds = [parse_world(text) for text in skill.worlds]
         layouts = [sample_layout(worlds[i % len(worlds)], int(seed), radius) for i, seed in enumerate(seeds)]

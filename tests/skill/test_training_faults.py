@@ -74,8 +74,8 @@ def test_physics_that_breaks_stops_training_and_names_the_episode(trained, at_st
     layouts: list[Layout] = []
 
     def break_simulation(trainer: SkillTrainer) -> None:
-        layouts.append(trainer.task.layouts[3])
-        trainer.task.sim.datas[3].qvel[0] = np.nan
+        layouts.append(trainer.batches.task.layouts[3])
+        trainer.batches.task.sim.datas[3].qvel[0] = np.nan
 
     at_step(384, break_simulation)
     code, line = trained()

@@ -1,0 +1,103 @@
+"""How batches of transitions are made: by simulations in this process, in other processes, or on a Ray cluster.
+
+A run is cut into segments. Each begins with freshly drawn episodes, whose worlds and noise follow from the seed and the
+place of the segment in the run alone, so that a segment can be collected again as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Protocol
+
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.modules import ProbabilisticActor
+
+from hiernav.config import TrainConfig
+from hiernav.nav.option import Planner
+from hiernav.sim.factory import RandomLayouts, make_task
+from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.skill.env import NavigationEnv
+from hiernav.skill.sac import exploring
+
+_BATCH_FRAMES = 128
+"""Steps collected by one process between two bursts of updates, at least one per simulation."""
+
+
+class Batches(Protocol):
+    """Where the trainer's transitions come from."""
+
+    frames: int
+    """Most transitions of a batch."""
+
+    def segment(self, steps: int, frames: int) -> Generator[TensorDict]:
+        """Batches (M,) of about `frames` transitions of fresh episodes, for a run that has `steps` of them so far."""
+        ...
+
+    def close(self) -> None:
+        """Stop whatever was started; safe to call twice."""
+        ...
+
+
+class LocalBatches:
+    """One batch of simulations in this process, stepped by torchrl's Collector.
+
+    Args:
+        config: the training.
+        policy: the learner's, whose weights may change between batches.
+        planner: guides the robots; the expert by default.
+    """
+
+    def __init__(self, config: TrainConfig, policy: ProbabilisticActor, planner: Planner | None = None) -> None:
+        self.config, self.policy = config, policy
+        skill = config.skill
+        self.frames = frames_of_batch(skill.num_envs, skill.total_steps)
+        self.task = make_task(config, skill.num_envs, planner, end_on_fall=skill.end_on_fall)
+        self._env = NavigationEnv(self.task)
+
+    def segment(self, steps: int, frames: int) -> Generator[TensorDict]:
+        skill = self.config.skill
+        self.task.draw_from(training_layouts(self.config, steps))
+        per_batch = frames_of_batch(skill.num_envs, frames)
+        collector = Collector(
+            self._env,
+            exploring(self.policy, skill),
+            frames_per_batch=per_batch,
+            total_frames=max(1, frames // per_batch) * per_batch,
+            init_random_frames=random_batches(self.config, steps, per_batch) * per_batch,
+            auto_register_policy_transforms=False,
+        )
+        try:
+            for data in collector:
+                yield data.reshape(-1)
+        finally:
+            collector.shutdown(close_env=False)
+
+    def close(self) -> None:
+        self.task.sim.close()
+
+
+def make_batches(config: TrainConfig, policy: ProbabilisticActor, planner: Planner | None = None) -> Batches:
+    """The source of batches that `skill.collector` names; nothing is started before its first segment."""
+    if config.skill.collector == "local":
+        return LocalBatches(config, policy, planner)
+    from hiernav.skill.workers import WorkerBatches
+
+    return WorkerBatches(config, policy, planner)
+
+
+def frames_of_batch(num_envs: int, frames: int) -> int:
+    """Steps of a batch of `num_envs` simulations, where `frames` steps are wanted in all."""
+    return num_envs * max(1, min(_BATCH_FRAMES, frames) // num_envs)
+
+
+def random_batches(config: TrainConfig, steps: int, frames: int) -> int:
+    """How many batches of `frames` are still to be collected with random actions, after `steps`."""
+    return -(-max(0, config.skill.learning_starts - steps) // frames)
+
+
+def training_layouts(config: TrainConfig, *place: int) -> RandomLayouts:
+    """The worlds of a segment: as many streams of them as there are places, none like another."""
+    worlds = [parse_world(text) for text in config.skill.worlds]
+    return RandomLayouts(worlds, (config.seed, 2, *place), get_robot(config.robot).radius)
