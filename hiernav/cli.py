@@ -99,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--no-repair", action="store_true", help="drive the network's plans even if they collide (cnn only)"
     )
+    evaluate.add_argument("--no-recovery", action="store_true", help="let a robot that stands still stand")
     evaluate.add_argument("--episodes", type=int, metavar="N", help="per world (protocol's number)")
     evaluate.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
     evaluate.add_argument("--json", metavar="FILE", help="write the results, an object per world; - for the screen")
@@ -232,6 +233,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             arguments.seed,
             repair=not arguments.no_repair,
             on_episode=show,
+            recover=not arguments.no_recovery,
         )
     if arguments.json == "-":
         print(json.dumps(results, indent=2))
@@ -412,7 +414,11 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
     console.print(table)
     for name, row in results.items():
         replans = ", ".join(f"{reason} {count}" for reason, count in row["replans"].items())
-        checked = f"; {row['repairs']} of {row['proposals']} plans repaired" if "repairs" in row else ""
+        checked = (
+            f"; {row['repairs']} of {row['proposals']} plans repaired, {row['loops']} for leading back"
+            if "repairs" in row
+            else ""
+        )
         console.print(f"{name}: plans ended by {replans}{checked}", style="dim", highlight=False)
 
 

@@ -87,6 +87,7 @@ def evaluate(
     repair: bool = True,
     rows: int = 64,
     on_episode: Callable[[str, int, Episode], None] | None = None,
+    recover: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Metrics of every world, by its name; the same for the same seed, whatever `rows` is.
 
@@ -96,6 +97,7 @@ def evaluate(
         episodes: per world; 200 (paper) or 1000 (strict) by default.
         repair: see `make_planner`.
         rows: simulations side by side.
+        recover: see `run_episodes`.
     """
     if protocol not in EPISODES:
         raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(EPISODES)}")
@@ -111,7 +113,7 @@ def evaluate(
         task = make_task(policies.config, min(rows, count), plan, [world])
         began = time.perf_counter()
         report = None if on_episode is None else partial(on_episode, name)
-        done = run_episodes(task, policies.skill, layouts, report)
+        done = run_episodes(task, policies.skill, layouts, report, recover=recover)
         if protocol == "paper" and world.kind == "gremlin":
             for episode in done:
                 episode.collisions = 0
@@ -151,6 +153,7 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
         "replans": {reason: sum(e.replans[reason] for e in episodes) for reason in reasons},
         "endings": {kind: sum(e.reason == kind for e in episodes) for kind in sorted({e.reason for e in episodes})},
         "refused": sum(e.refused for e in episodes),
+        "recoveries": sum(e.recoveries for e in episodes),
     }
 
 

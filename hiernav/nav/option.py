@@ -18,6 +18,7 @@ from hiernav.nav import path
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.observation import ObservationLayout, clock_phase
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.recovery import Recovery
 
 Skill = Callable[[np.ndarray], np.ndarray]
 """Observations (N, D) float32 -> actions (N, A) float32 in [-1, 1]."""
@@ -315,11 +316,13 @@ class HierarchicalAgent:
     """Time between two calls of `act` [s]."""
 
     def __post_init__(self) -> None:
+        self.recovery = Recovery(self.option.num_rows, self.control_period)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
         self.option.reset(rows)
+        self.recovery.reset(rows)
         self._steps[slice(None) if rows is None else rows] = 0
 
     def act(
@@ -340,7 +343,8 @@ class HierarchicalAgent:
         step = self.option.step(pose[:, :2], goal, occupancy)
         observation = self.layout.build(guided(terms, pose, step.plan, goal, self._steps * self.control_period))
         self._steps += 1
-        return AgentStep(self.skill(observation), observation, step)
+        action = self.recovery(pose[:, :2], step.plan, self.skill(observation))
+        return AgentStep(action, observation, step)
 
 
 def guided(

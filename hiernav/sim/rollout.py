@@ -9,6 +9,7 @@ import numpy as np
 
 from hiernav.nav.option import Skill, TerminationReason
 from hiernav.nav.path import arc_lengths
+from hiernav.nav.recovery import Recovery
 from hiernav.nav.search import PathField
 from hiernav.sim.layout import GOAL_RADIUS, Layout
 from hiernav.sim.task import NavigationTask, TaskStep
@@ -33,6 +34,8 @@ class Episode:
     """Of the shortest path for a disc of the robot's radius, up to the goal's radius [m]."""
     replans: dict[str, int]
     refused: int
+    recoveries: int
+    """Times the robot stood still and backed out."""
     plan_seconds: float
     """Time spent in the planner."""
 
@@ -55,6 +58,7 @@ def run_episodes(
     layouts: Sequence[Layout],
     on_episode: Callable[[int, Episode], None] | None = None,
     on_step: Callable[[TaskStep], None] | None = None,
+    recover: bool = True,
 ) -> list[Episode]:
     """Drive every layout to its end, `task.num_rows` at a time; results in the order of the layouts.
 
@@ -64,6 +68,7 @@ def run_episodes(
         skill: observations (N, D) -> actions (N, A).
         on_episode: called with the index of the layout and the episode, in the order in which they end.
         on_step: called after every control step, before `on_episode` and before rows that ended start anew.
+        recover: whether a robot that stands still backs out, as it does when deployed (`Recovery`).
     """
     if not layouts:
         return []
@@ -76,11 +81,13 @@ def run_episodes(
     task.reset(layouts=[layouts[row % rows] for row in range(task.num_rows)])
     driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))
     collisions = np.zeros(task.num_rows, dtype=np.int64)
+    recovery = Recovery(task.num_rows, task.robot.control_period)
     while (current >= 0).any():
         idle = current < 0
         task.goal[idle] = task.pose[idle, :2]  # where it is: a robot at its goal asks for no plans
         before = task.pose[:, :2]
-        step = task.step(skill(task.observation))
+        action = skill(task.observation)
+        step = task.step(recovery(before, task.option.plan, action) if recover else action)
         driven += np.linalg.norm(task.pose[:, :2] - before, axis=-1)
         earned += step.reward
         collisions += step.collided
@@ -105,6 +112,7 @@ def run_episodes(
                 shortest_length=shortest_length(layout, task.robot.radius),
                 replans={r.name.lower(): int(counts[r]) for r in TerminationReason if r != TerminationReason.NONE},
                 refused=int(task.option.refused[row]),
+                recoveries=int(recovery.counts[row]),
                 plan_seconds=float(planned[row]),
             )
             results[current[row]] = episode
@@ -118,6 +126,7 @@ def run_episodes(
         task.reset(again, [layouts[index] for index in following.tolist()])
         for values in (driven, earned, planned, collisions):
             values[ended] = 0
+        recovery.reset(ended)
     return [episode for episode in results if episode is not None]
 
 

@@ -85,7 +85,8 @@ def test_a_skill_that_follows_waypoints_reaches_goals_on_short_ways() -> None:
             assert episode.reason == "goal" and episode.replans["goal"] == 1
             assert episode.spl > 0.7
             assert episode.steps_counted == episode.steps < episode.cap
-            assert episode.return_ > 0.0
+            if not episode.collisions:
+                assert episode.return_ > 0.0
             assert episode.path_length >= 0.9 * episode.shortest_length
 
 

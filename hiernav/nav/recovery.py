@@ -1,0 +1,80 @@
+"""Getting away from where the skill stands still: the same bounded manoeuvre in evaluation and on the robot.
+
+A skill without memory can settle in a posture that its own mean action holds for ever, or push at an obstacle. What
+led there is undone for a moment: the action is reversed, and the skill starts again from another posture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Recovery:
+    """Reverses the actions of robots that should move and do not.
+
+    A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away. Its
+    actions are then negated for `duration_s`. After `limit` recoveries without coming `clear_m` away from where the
+    first of them began, it is given up and its actions are left alone.
+
+    Attributes:
+        counts: (N,) int, recoveries since the reset.
+        given_up: (N,) bool.
+    """
+
+    def __init__(
+        self,
+        num_rows: int,
+        control_period: float,
+        window_s: float = 1.5,
+        least_m: float = 0.05,
+        duration_s: float = 0.4,
+        limit: int = 3,
+        clear_m: float = 0.5,
+    ) -> None:
+        self.least_m, self.limit, self.clear_m = least_m, limit, clear_m
+        self._duration = max(1, round(duration_s / control_period))
+        self._trail = np.full((max(1, round(window_s / control_period)), num_rows, 2), np.nan)
+        self._tick = 0
+        self._left = np.zeros(num_rows, dtype=np.int64)
+        self._tries = np.zeros(num_rows, dtype=np.int64)
+        self._place = np.full((num_rows, 2), np.nan)
+        self.counts = np.zeros(num_rows, dtype=np.int64)
+        self.given_up = np.zeros(num_rows, dtype=bool)
+
+    def reset(self, rows: np.ndarray | slice | None = None) -> None:
+        """Start new episodes in some rows (all by default)."""
+        rows = slice(None) if rows is None else rows
+        self._trail[:, rows], self._place[rows] = np.nan, np.nan
+        self._left[rows] = self._tries[rows] = self.counts[rows] = 0
+        self.given_up[rows] = False
+
+    def __call__(self, position: np.ndarray, plan: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """The action to take, once per control step.
+
+        Args:
+            position: (N, 2) world frame [m].
+            plan: (N, K, 2) world frame [m]; a plan that ends where the robot is asks it to stay.
+            action: (N, A) of the skill.
+
+        Returns:
+            (N, A), a new array.
+        """
+        slot = self._tick % len(self._trail)
+        self._tick += 1
+        # comparisons with NaN, where the window is not full or a position unknown, are False
+        moved = np.linalg.norm(position - self._trail[slot], axis=-1)
+        self._trail[slot] = position
+        self._tries[np.linalg.norm(position - self._place, axis=-1) > self.clear_m] = 0
+        ahead = np.linalg.norm(plan[:, -1] - position, axis=-1)
+        stuck = (moved < self.least_m) & (ahead > self.least_m) & (self._left == 0)
+        self.given_up = stuck & (self._tries >= self.limit)
+        begins = stuck & ~self.given_up
+        first = begins & (self._tries == 0)
+        self._place[first] = position[first]
+        self._trail[:, begins] = np.nan
+        self._left[begins] = self._duration
+        self._tries += begins
+        self.counts += begins
+        reversed_ = self._left > 0
+        self._left -= reversed_
+        return np.where(reversed_[:, None], -action, action)
