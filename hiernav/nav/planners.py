@@ -119,8 +119,9 @@ class VerifiedPlanner:
     """Checks every proposal and replaces the bad ones by the shortest path.
 
     A proposal is bad if its sweep meets the map, or if its second half leads where the robot has been: a network
-    without memory can lead to and fro between two ways, a shortest path never does. Counts proposals, repairs, loops (the repairs of the second kind) and
-    refusals (no path exists either; the row is NaN then, or the proposal that leads back if it is free).
+    without memory can lead to and fro between two ways, a shortest path never does. Counts proposals, repairs, loops
+    (the repairs of the second kind) and refusals (no path exists either: the row is NaN then, or the proposal that
+    leads back if it is free).
     """
 
     planner: Planner
