@@ -68,6 +68,9 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     worlds: Annotated[tuple[World, ...], Meta(min_length=1, description="Worlds to train in, in equal parts.")] = (
         "pillar(2,2,10)",
     )
+    phase_in: Annotated[
+        float, Meta(ge=0, le=1, description="Share of training over which the worlds after the first are added.")
+    ] = 0.0
     planner: Annotated[
         Literal["astar", "cnn"], Meta(description="Who plans in training: exact search or the trained network.")
     ] = "astar"

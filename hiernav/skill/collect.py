@@ -13,10 +13,10 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.modules import ProbabilisticActor
 
-from hiernav.config import TrainConfig
+from hiernav.config import SkillConfig, TrainConfig
 from hiernav.nav.option import Planner
 from hiernav.sim.factory import RandomLayouts, make_task
-from hiernav.sim.layout import parse_world
+from hiernav.sim.layout import WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.skill.env import NavigationEnv
 from hiernav.skill.sac import exploring
@@ -97,7 +97,13 @@ def random_batches(config: TrainConfig, steps: int, frames: int) -> int:
     return -(-max(0, config.skill.learning_starts - steps) // frames)
 
 
-def training_layouts(config: TrainConfig, *place: int) -> RandomLayouts:
-    """The worlds of a segment: as many streams of them as there are places, none like another."""
-    worlds = [parse_world(text) for text in config.skill.worlds]
-    return RandomLayouts(worlds, (config.seed, 2, *place), get_robot(config.robot).radius)
+def training_layouts(config: TrainConfig, steps: int, *place: int) -> RandomLayouts:
+    """The worlds of a segment that begins after so many steps: a stream for every place, none like another."""
+    worlds = training_worlds(config.skill, steps)
+    return RandomLayouts(worlds, (config.seed, 2, steps, *place), get_robot(config.robot).radius)
+
+
+def training_worlds(skill: SkillConfig, steps: int) -> list[WorldSpec]:
+    """Worlds that episodes are drawn from after so many steps: the first one, and one more at a time."""
+    worlds, ramp = [parse_world(text) for text in skill.worlds], skill.phase_in * skill.total_steps
+    return worlds if steps >= ramp else worlds[: 1 + int(steps / ramp * (len(worlds) - 1))]

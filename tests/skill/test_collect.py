@@ -1,0 +1,33 @@
+"""Which worlds a segment of training draws its episodes from."""
+
+from __future__ import annotations
+
+import pytest
+
+from hiernav.config import load_config
+from hiernav.skill.collect import training_layouts, training_worlds
+
+pytestmark = pytest.mark.train
+
+WORLDS = ["pillar(2,2,5)", "gremlin", "two-room"]
+CONFIG = load_config(None, [f"skill.worlds={WORLDS}", "skill.total_steps=1000", "skill.learning_starts=0"])
+PHASED = load_config(None, [*(f"skill.{k}" for k in (f"worlds={WORLDS}", "phase_in=0.4", "total_steps=4000"))])
+
+
+@pytest.mark.parametrize(("steps", "count"), [(0, 1), (799, 1), (800, 2), (1599, 2), (1600, 3), (4000, 3)])
+def test_worlds_are_added_one_at_a_time(steps: int, count: int) -> None:
+    assert [world.kind for world in training_worlds(PHASED.skill, steps)] == ["pillar", "gremlin", "two-room"][:count]
+
+
+def test_without_phasing_in_all_worlds_are_there_from_the_start() -> None:
+    assert len(training_worlds(CONFIG.skill, 0)) == 3
+
+
+def test_every_segment_and_every_worker_has_episodes_of_its_own() -> None:
+    def seeds(*place: int) -> list[int]:
+        draw = training_layouts(CONFIG, *place)
+        return [draw(row).seed for row in range(3)]
+
+    places = [seeds(0), seeds(256), seeds(256, 0, 0), seeds(256, 1, 0)]
+    assert len({seed for place in places for seed in place}) == 12
+    assert seeds(256, 1, 0) == places[-1]
