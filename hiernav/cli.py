@@ -349,7 +349,10 @@ def _config(arguments: argparse.Namespace) -> int:
     for setting in describe_config():
         # escaped: units in brackets are no markup
         table.add_row(*map(escape, (setting.path, setting.type, str(setting.default), setting.description)))
-    Console().print(table)
+    console = Console()
+    if not console.is_terminal:
+        console.width = 1_000  # one line per setting, for grep
+    console.print(table)
     return 0
 
 

@@ -48,7 +48,7 @@ def episode(**changes: object) -> Episode:
     values: dict[str, object] = {
         "seed": 0, "reached": True, "reason": "goal", "steps": 40, "cap": 300, "collisions": 0, "return_": 1.0,
         "path_length": 2.0, "shortest_length": 1.0, "replans": dict.fromkeys(REASONS, 1), "refused": 0,
-        "plan_seconds": 0.1,
+        "recoveries": 1, "plan_seconds": 0.1,
     }  # fmt: skip
     return Episode(**(values | changes))  # type: ignore[arg-type]
 
@@ -96,7 +96,7 @@ def test_a_summary_counts_every_episode_once():
     assert summary["return_mean"] == 0.5
     assert summary["endings"] == {"goal": 2, "left_field": 1, "timeout": 1}
     assert summary["replans"] == dict.fromkeys(REASONS, 3) | {"half_index": 10}
-    assert summary["refused"] == 2
+    assert (summary["refused"], summary["recoveries"]) == (2, 4)
 
 
 def test_the_seeds_of_a_short_evaluation_are_the_first_of_a_long_one():
@@ -168,7 +168,7 @@ def test_contacts_with_gremlins_count_under_the_strict_protocol_alone():
 def test_each_protocol_has_its_number_of_episodes(monkeypatch):
     driven: list[int] = []
 
-    def drive(task, skill, layouts, on_episode):
+    def drive(task, skill, layouts, on_episode, recover):
         driven.append(len(layouts))
         return [episode() for _ in layouts]
 

@@ -126,7 +126,9 @@ def test_a_film_of_a_map_is_named_after_the_map(tmp_path):
 
 def test_the_caption_tells_how_an_episode_ended():
     episodes = [
-        Episode(0, reason == "goal", reason, 9, 10, 0, 0.0, 1.0, 1.0, REPLANS, 0, 0.0)
+        Episode(
+            0, reason == "goal", reason, 9, 10, 0, 0.0, 1.0, 1.0, REPLANS, refused=0, recoveries=0, plan_seconds=0.0
+        )
         for reason in ("goal", "left_field", "timeout", "physics")
     ]
     strips = [caption(LEAST_WIDTH, "world", "step 9", REPLANS, episode) for episode in (None, *episodes)]
