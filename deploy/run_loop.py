@@ -25,9 +25,10 @@ from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.search import is_solvable
 from hiernav.runtime.clock import FakeClock, MonotonicClock
-from hiernav.runtime.driver import Driver, DriverConfig, Tick
+from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.observe import Observer, TickRecord
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.sim_robot import EXACT, SensorNoise, SimRobot
@@ -43,7 +44,7 @@ TILT_LIMIT = np.deg2rad(75.0)
 """Tilt at which a robot with a free base has fallen [rad]."""
 
 
-class Drive:
+class Drive(Observer):
     """What one drive looked like, collected tick by tick for its picture."""
 
     def __init__(self, robot: SimRobot) -> None:
@@ -53,13 +54,13 @@ class Drive:
         self.collisions: list[np.ndarray] = []
         self.first_tick_age: float | None = None
 
-    def __call__(self, tick: Tick) -> None:
+    def tick(self, record: TickRecord) -> None:
         if self.first_tick_age is None:
             self.first_tick_age = process_age()
         truth = self.robot.truth()
         self.path.append(truth.pose[:2])
-        if tick.decision is not None and tick.decision.replanned[0]:
-            self.plans.append(tick.decision.plan[0])
+        if record.replanned and record.plan is not None:
+            self.plans.append(record.plan)
         if truth.collided:
             self.collisions.append(truth.pose[:2])
 

@@ -283,6 +283,8 @@ class AgentStep:
 
     action: np.ndarray
     """(N, A) float32 in [-1, 1]."""
+    proposed: np.ndarray
+    """(N, A) float32 what the skill said, before any recovery."""
     observation: np.ndarray
     """(N, D) float32."""
     option: OptionStep
@@ -294,6 +296,10 @@ class AgentStep:
     @property
     def plan(self) -> np.ndarray:
         return self.option.plan
+
+    @property
+    def start(self) -> np.ndarray:
+        return self.option.start
 
     @property
     def replanned(self) -> np.ndarray:
@@ -343,8 +349,9 @@ class HierarchicalAgent:
         step = self.option.step(pose[:, :2], goal, occupancy)
         observation = self.layout.build(guided(terms, pose, step.plan, goal, self._steps * self.control_period))
         self._steps += 1
-        action = self.recovery(pose[:, :2], step.plan, self.skill(observation))
-        return AgentStep(action, observation, step)
+        proposed = self.skill(observation)
+        action = self.recovery(pose[:, :2], step.plan, proposed)
+        return AgentStep(action, proposed, observation, step)
 
 
 def guided(

@@ -6,7 +6,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,12 +17,16 @@ from hiernav.runtime.clock import Clock
 from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit
-from hiernav.runtime.robot import Robot, SensorFrame
+from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.robot import Robot, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
 from hiernav.runtime.timing import TickTimer
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
+
+FLUSH_SECONDS = 1.0
+"""What observers are given to bring their data to safety once the robot is braked [s]."""
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +44,12 @@ class Decision(Protocol):
     def replanned(self) -> np.ndarray: ...
     @property
     def plan_seconds(self) -> float: ...
+    @property
+    def observation(self) -> np.ndarray: ...
+    @property
+    def proposed(self) -> np.ndarray: ...
+    @property
+    def start(self) -> np.ndarray: ...
 
 
 class Agent(Protocol):
@@ -73,22 +83,6 @@ class DriverConfig:
         for name, value in self.__dict__.items():
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"DriverConfig.{name} = {value} must be finite and positive")
-
-
-@dataclass(frozen=True)
-class Tick:
-    """Everything about one control step, for recorders and viewers. Nothing in it is written again."""
-
-    now: float
-    """On the loop's clock [s]."""
-    mode: Mode
-    frame: SensorFrame
-    estimate: Estimate | None
-    decision: Decision | None
-    sent: np.ndarray | None
-    """(A,) what the robot was really sent."""
-    goal: np.ndarray
-    """(2,) world frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +128,7 @@ class Driver:
         guard: Guard | None = None,
         config: DriverConfig | None = None,
         timer: TickTimer | None = None,
-        observers: Sequence[Callable[[Tick], None]] = (),
+        observers: Sequence[Observer] = (),
     ) -> None:
         """
         Args:
@@ -143,16 +137,17 @@ class Driver:
             occupancy: the known map at a stamp of the robot's clock [s]; the same object while nothing has moved.
             clock: paces the loop.
             estimator, guard, config, timer: defaults if None.
-            observers: called at the end of every tick; one that raises is dropped.
+            observers: told of every tick and event; one that raises is dropped.
         """
         self.robot, self.agent, self.occupancy, self.clock = robot, agent, occupancy, clock
         self.estimator = estimator or Estimator()
         self.guard = guard or Guard(robot.action_dim)
         self.config = config or DriverConfig()
         self.timer = timer or TickTimer(SECTIONS)
-        self.supervisor = Supervisor()
+        self.supervisor = Supervisor(lambda now, mode, why: self._emit("mode", why, now, mode=mode.value))
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
         self.observers = list(observers)
+        self._truth: Callable[[], Truth] | None = getattr(robot, "truth", None)
         self.interrupted = False
         """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
 
@@ -177,7 +172,9 @@ class Driver:
         self._fresh_at: float | None = None
         self._fresh_stamp = -math.inf
         self._terms = TermHold()
+        self._plan_stamp: float | None = None
         self._replans: Counter[str] = Counter()
+        self._emit("goal", f"{self.goal[0]:g}, {self.goal[1]:g}", self.clock.now(), x=self.goal[0], y=self.goal[1])
         self.agent.reset()
         self.guard.reset()
         self.estimator.reset()
@@ -188,9 +185,11 @@ class Driver:
         if self.interrupted:
             self._reason = "interrupted"
         reason = self._reason or "interrupted"
+        self._tell(lambda observer: observer.flush(FLUSH_SECONDS))
         stopped = self._stop()
         if self.supervisor.mode is not Mode.FAULT:
             self.supervisor.change(Mode.STOPPED, reason, self.clock.now())
+        self._emit("end", reason, self.clock.now(), steps=self._steps, stopped=stopped)
         position = self._estimate.pose[:2] if self._estimate is not None else np.full(2, np.nan)
         return RunResult(
             reason=reason,
@@ -217,6 +216,7 @@ class Driver:
         timer = self.timer
         timer.begin()
         frame = self.robot.read()
+        truth = self._truth() if self._truth is not None and self.observers else None
         self._last_stamp = frame.stamp
         timer.mark("read")
         self._estimate = estimate = self.estimator.update(frame)
@@ -224,18 +224,19 @@ class Driver:
         if self._is_blind(estimate, now) or estimate is None:
             self.robot.brake()
             timer.mark("send")
-            self._finish_tick(Tick(now, self.supervisor.mode, frame, None, None, None, self.goal))
+            self._finish_tick(now, frame, truth, estimate, None, None, None)
             return self._reason is not None
         if self.supervisor.mode is not Mode.RUNNING:
             self._start(frame.stamp, now)
         occupancy = self.occupancy(frame.stamp)
         if self._is_over(estimate, occupancy):
-            self._finish_tick(Tick(now, self.supervisor.mode, frame, estimate, None, None, self.goal))
+            self._finish_tick(now, frame, truth, estimate, occupancy, None, None)
             return True
 
         decision = self.agent.act(estimate.pose[None], self._terms.fill(frame), self.goal[None], [occupancy])
         if bool(decision.replanned[0]):
             self._replans[TerminationReason(int(decision.reason[0])).name.lower()] += 1
+            self._plan_stamp = estimate.stamp
             timer.mark_split("infer", "plan", float(decision.plan_seconds))
         else:
             timer.mark("infer")
@@ -246,7 +247,7 @@ class Driver:
         self._steps += 1
         if guarded.fault is not None:
             self._fail(guarded.fault, now)
-        self._finish_tick(Tick(now, self.supervisor.mode, frame, estimate, decision, sent, self.goal))
+        self._finish_tick(now, frame, truth, estimate, occupancy, decision, sent)
         return self._reason is not None
 
     def _start(self, stamp: float, now: float) -> None:
@@ -281,14 +282,58 @@ class Driver:
         self._reason = "fault"
         self.supervisor.fail(why, now)
 
-    def _finish_tick(self, tick: Tick) -> None:
+    def _finish_tick(
+        self,
+        now: float,
+        frame: SensorFrame,
+        truth: Truth | None,
+        estimate: Estimate | None,
+        occupancy: OccupancyMap | None,
+        decision: Decision | None,
+        sent: np.ndarray | None,
+    ) -> None:
         self.timer.end()
+        if not self.observers:
+            return
+        record = TickRecord(
+            index=self.loop.ticks - 1,
+            time=now,
+            lateness=self.loop.late,
+            mode=self.supervisor.mode,
+            frame=frame,
+            goal=self.goal,
+            occupancy=occupancy,
+            estimate=estimate,
+            truth=truth,
+            sent=sent,
+            timings=self.timer.last,
+        )
+        if decision is not None and estimate is not None:
+            record = replace(
+                record,
+                plan=decision.plan[0],
+                plan_start=decision.start[0],
+                plan_stamp=self._plan_stamp,
+                plan_age=None if self._plan_stamp is None else estimate.stamp - self._plan_stamp,
+                reason=TerminationReason(int(decision.reason[0])),
+                replanned=bool(decision.replanned[0]),
+                observation=decision.observation[0],
+                proposed=decision.proposed[0],
+            )
+        self._tell(lambda observer: observer.tick(record))
+
+    def _tell(self, what: Callable[[Observer], None]) -> None:
         for observer in self.observers[:]:
             try:
-                observer(tick)
+                what(observer)
             except Exception:
                 log.exception("observer failed and is dropped")
                 self.observers.remove(observer)
+
+    def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
+        if self.observers:
+            event = Event(now, kind, text, values)
+            self._tell(lambda observer: observer.event(event))
 
     def _stop(self) -> bool:
         """Brake until the measured speed shows that the robot stands; False if it could not be shown in time."""

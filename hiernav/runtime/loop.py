@@ -59,6 +59,8 @@ class FixedRateLoop:
         self.clock = clock
         self.period = period
         self.lateness = Histogram()
+        self.late = 0.0
+        """How long after its deadline the present tick began [s]."""
         self.ticks = 0
         self.overruns = 0
         """Deadlines that were skipped, in all."""
@@ -106,7 +108,8 @@ class FixedRateLoop:
             deadline = start + index * self.period
             self.clock.sleep_until(deadline)
             now = self.clock.now()
-            self.lateness.record(max(now - deadline, 0.0))
+            self.late = max(now - deadline, 0.0)
+            self.lateness.record(self.late)
             self.ticks += 1
             if self._tick(now):
                 return

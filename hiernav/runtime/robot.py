@@ -40,6 +40,24 @@ class SensorFrame:
         return {name: value for name, value in present.items() if value is not None} | dict(self.extra)
 
 
+@dataclass(frozen=True)
+class Truth:
+    """What really happened to a simulated robot. For recorder and summary alone; nothing that drives may see it."""
+
+    time: float
+    """Since the reset [s]."""
+    pose: np.ndarray
+    """(3,) x, y, yaw; world frame [m, m, rad]."""
+    velocity: np.ndarray
+    """(2,) world frame [m/s]."""
+    upright: float
+    """z component of the body's z axis."""
+    collided: bool
+    """Contact with an obstacle in the last control step."""
+    collisions: int
+    """Control steps with contact since the reset."""
+
+
 class Robot(Protocol):
     """A robot, simulated or real. Adapters brake by themselves when commands stop coming (`CommandWatchdog`)."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime.clock import Clock
-from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame
+from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame, Truth
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.robots import RobotSpec
 from hiernav.sim.scene import SceneSpec, scene_for
@@ -59,23 +59,6 @@ class SensorNoise:
 
 EXACT = SensorNoise(accelerometer=0.0, gyro=0.0, magnetometer=0.0, velocimeter=0.0, fix=0.0)
 """Sensors without errors; the fix still comes at its own rate."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What really happened. For the recorder and the summary alone; nothing that drives may see it."""
-
-    time: float
-    """Since the reset [s]."""
-    pose: np.ndarray
-    """(3,) x, y, yaw; world frame [m, m, rad]."""
-    velocity: np.ndarray
-    """(2,) world frame [m/s]."""
-    upright: float
-    collided: bool
-    """Contact with an obstacle in the last control step."""
-    collisions: int
-    """Control steps with contact since the reset."""
 
 
 class SimRobot:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
 
 
@@ -40,7 +41,9 @@ class InvalidTransition(RuntimeError):
 class Supervisor:
     """Holds the mode and lets it change only along `TRANSITIONS`."""
 
-    def __init__(self) -> None:
+    def __init__(self, changed: Callable[[float, Mode, str], None] | None = None) -> None:
+        """`changed(now, mode, why)` is called after every change."""
+        self._changed = changed
         self.mode = Mode.INIT
         self.fault: str | None = None
         """Why it is in FAULT."""
@@ -78,3 +81,5 @@ class Supervisor:
     def _enter(self, mode: Mode, why: str, now: float) -> None:
         self.mode = mode
         self.history.append((now, mode, why))
+        if self._changed is not None:
+            self._changed(now, mode, why)

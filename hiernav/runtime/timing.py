@@ -72,6 +72,8 @@ class TickTimer:
     def __init__(self, sections: tuple[str, ...] = (), stopwatch: Callable[[], float] = time.perf_counter) -> None:
         self.sections: dict[str, Histogram] = {name: Histogram() for name in sections}
         self.tick = Histogram()
+        self.last: dict[str, float] = {}
+        """Durations of the present tick's sections so far [s]; a new one each tick."""
         self._stopwatch = stopwatch
         self._begun = self._last = stopwatch()
         self._recent: deque[float] = deque(maxlen=64)
@@ -80,6 +82,7 @@ class TickTimer:
         """Start of a tick."""
         self._begun = self._last = self._stopwatch()
         self._recent.append(self._begun)
+        self.last = {}
 
     def mark(self, section: str) -> float:
         """End of `section`, which began at the last mark; returns its duration [s]."""
@@ -101,6 +104,7 @@ class TickTimer:
         if histogram is None:
             histogram = self.sections[section] = Histogram()
         histogram.record(seconds)
+        self.last[section] = seconds
 
     def end(self) -> float:
         """End of the tick; returns its duration [s]."""

@@ -13,9 +13,10 @@ from rich.console import Console
 from hiernav.nav.occupancy import OccupancyMap, empty_map
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import FakeClock
-from hiernav.runtime.driver import Driver, DriverConfig, Tick
+from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import Episode, print_summary, summarise
@@ -80,6 +81,18 @@ class Decided:
     plan: np.ndarray
     replanned: np.ndarray
     plan_seconds: float = 0.001
+
+    @property
+    def proposed(self) -> np.ndarray:
+        return self.action
+
+    @property
+    def observation(self) -> np.ndarray:
+        return np.zeros((1, 3), np.float32)
+
+    @property
+    def start(self) -> np.ndarray:
+        return np.zeros((1, 2))
 
 
 @dataclass
@@ -270,16 +283,45 @@ def test_a_goal_must_be_two_finite_coordinates(goal):
     assert robot.log == []
 
 
-def test_observers_see_every_tick_and_a_failing_one_does_not_stop_the_robot():
-    ticks: list[Tick] = []
+class Listener(Observer):
+    def __init__(self) -> None:
+        self.records: list[TickRecord] = []
+        self.events: list[Event] = []
+        self.flushed: list[int] = []
 
-    def broken(tick: Tick) -> None:
+    def tick(self, record: TickRecord) -> None:
+        self.records.append(record)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def flush(self, timeout: float) -> None:
+        self.flushed.append(len(self.records))
+
+
+class Broken(Observer):
+    def tick(self, record: TickRecord) -> None:
         raise OSError("disk full")
 
-    result = driver_of(observers=[broken, ticks.append]).run(GOAL)
+
+def test_observers_see_every_tick_and_a_failing_one_does_not_stop_the_robot():
+    seen = Listener()
+    result = driver_of(observers=[Broken(), seen]).run(GOAL)
     assert result.reached
-    assert len(ticks) == result.steps + 1
-    assert all(tick.mode is Mode.RUNNING and tick.sent is not None for tick in ticks[:-1])
+    assert [record.index for record in seen.records] == list(range(result.steps + 1))
+    assert all(record.mode is Mode.RUNNING and record.sent is not None for record in seen.records[:-1])
+    assert seen.records[-1].sent is None
+    assert seen.records[7].plan_age == pytest.approx(2 * PERIOD)
+    assert {"read", "estimate", "infer", "guard", "send"} <= set(seen.records[7].timings)
+
+
+def test_events_tell_of_goal_modes_and_end_and_the_flush_comes_once_braked():
+    seen = Listener()
+    result = driver_of(observers=[seen]).run(GOAL)
+    assert [(event.kind, event.text) for event in seen.events][::5] == [("goal", "0.98, 0"), ("end", "goal")]
+    assert [event.values["mode"] for event in seen.events if event.kind == "mode"] == [
+        "ready", "armed", "running", "stopped"]  # fmt: skip
+    assert seen.flushed == [result.steps + 1]
 
 
 def test_a_missing_or_broken_reading_keeps_its_last_good_value():
