@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
+
+
+class Trust(IntEnum):
+    """What an estimate is good for."""
+
+    GOOD = 0
+    HOLD = 1
+    """Too old or too vague to drive on; the robot waits, braked."""
+    LOST = 2
+    """Waiting does not help any more: a fault."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +57,14 @@ class EstimatorConfig:
     """Oldest fix that can still be used [s]."""
     max_jump: float = 6.0
     """A gyro reading that differs more than this from the last is taken for a spike [rad/s]."""
+    hold_after: float = 0.25
+    """An inertial sensor that says nothing new for this long is not driven without [s]."""
+    lost_after: float = 0.8
+    """An inertial sensor that says nothing new for this long is lost [s]."""
+    fix_hold_after: float = 2.0
+    """Without a new position fix for this long, dead reckoning is not driven on [s]."""
+    fix_lost_after: float = 5.0
+    """Without a new position fix for this long, the position is lost [s]."""
 
     def __post_init__(self) -> None:
         for name, value in self.__dict__.items():
@@ -56,6 +75,12 @@ class EstimatorConfig:
         for name in ("reinit_after", "resync_after"):
             if getattr(self, name) < 2:
                 raise ValueError(f"EstimatorConfig.{name} = {getattr(self, name)} must be at least 2")
+        for first, second in (("hold_after", "lost_after"), ("fix_hold_after", "fix_lost_after")):
+            if not getattr(self, first) < getattr(self, second):
+                raise ValueError(
+                    f"EstimatorConfig.{first} = {getattr(self, first)} must be less than {second} = "
+                    f"{getattr(self, second)}"
+                )
         if not math.hypot(*self.magnetic_field[:2]) > 0.0:
             raise ValueError(f"EstimatorConfig.magnetic_field = {self.magnetic_field} must have a horizontal part")
 
@@ -76,3 +101,8 @@ class Estimate:
     """z component of the body's z axis: 1 upright, 0 on its side, -1 on its back."""
     yaw_rate: float
     """Turning rate of the heading without the gyro's bias [rad/s]."""
+    trust: Trust = Trust.GOOD
+    why: str = ""
+    """What the estimate suffers from, where it is not good."""
+    restarts: int = 0
+    """How often position or heading were started again, as after being carried away. Plans made before are void."""

@@ -8,12 +8,13 @@ from collections import Counter, deque
 import numpy as np
 from scipy.special import chdtri
 
-from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
+from hiernav.runtime.freshness import SensorWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, wrap
-from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
 
-__all__ = ["Estimate", "Estimator", "EstimatorConfig"]
+__all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
 
 ABSURD = 1e6
 """No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
@@ -57,6 +58,10 @@ class Estimator:
         self._rejected: Counter[str] = Counter()
         self._last_miss: dict[str, tuple[float, ...]] = {}
         self._history: deque[list[float]] = deque()
+        self._restarts = 0
+        # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
+        sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
+        self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
 
     @property
     def ready(self) -> bool:
@@ -73,14 +78,24 @@ class Estimator:
             The state at the newest stamp; None until position and heading are known.
         """
         if self._accept_stamp(float(frame.stamp)):
-            field = self._trusted_field(frame.magnetometer)
-            self._predict(frame, field)
+            readings = {name: self._read(name, getattr(frame, name)) for name in VECTOR_SENSORS}
+            field = self._trusted_field(readings["magnetometer"])
+            self._predict(readings["gyro"], readings["accelerometer"], field)
             forward, left = level_axes(self._tilt.up)
             self._correct_yaw(field, forward, left)
-            self._correct_velocity(_vector(frame.velocimeter), forward, left)
+            self._correct_velocity(readings["velocimeter"], forward, left)
             self._remember()
             self._correct_position(frame)
         return self._estimate() if self.ready else None
+
+    def _read(self, name: str, value: np.ndarray | None) -> Vector | None:
+        """A sensor's reading, unless it is missing, garbage, or frozen for too long to be believed."""
+        reading = _vector(value)
+        self._watch.see(name, reading, self._stamp)
+        if reading is not None and self._watch.silence(name, self._stamp) >= self.config.hold_after:
+            self.counts[f"{name}_frozen"] += 1
+            return None
+        return reading
 
     def _accept_stamp(self, stamp: float) -> bool:
         """Move on to `stamp`; False if the frame is to be dropped."""
@@ -94,18 +109,18 @@ class Estimator:
         self._stamp = stamp
         return True
 
-    def _predict(self, frame: SensorFrame, field: Vector | None) -> None:
+    def _predict(self, gyro: Vector | None, accelerometer: Vector | None, field: Vector | None) -> None:
         """Bring tilt, heading and position to the new stamp."""
         config = self.config
         dt, first = self._step, self._step == 0.0
-        rate, change = self._measured_rate(frame.gyro)
+        rate, change = self._measured_rate(gyro)
         if first:
             self._rate = rate
         mean = _mean(self._rate, rate)
         if config.tilts:
             if dt > 0.0:
                 self._tilt.predict(dt, mean, change)
-            self._tilt.correct(field, _vector(frame.accelerometer), self._gate_1)
+            self._tilt.correct(field, accelerometer, self._gate_1)
         _, uy, uz = self._tilt.up
         # Of the body rates, what turns the heading: Euler's kinematic equation for yaw, in terms of `up`.
         level = max(uy * uy + uz * uz, 1e-2)
@@ -116,9 +131,8 @@ class Estimator:
             self._filter.predict_motion(dt, mean_yaw_rate, math.sqrt(variance))
         self._rate = rate
 
-    def _measured_rate(self, gyro: np.ndarray | None) -> tuple[Vector, float]:
+    def _measured_rate(self, rate: Vector | None) -> tuple[Vector, float]:
         """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
-        rate = _vector(gyro)
         if rate is None or max(map(abs, rate)) > MAX_RATE:
             return self._rate, 1.0
         jump = math.dist(rate, self._rate)
@@ -129,9 +143,8 @@ class Estimator:
         # What a jump adds to the angle is as uncertain as it is large.
         return rate, jump
 
-    def _trusted_field(self, magnetometer: np.ndarray | None) -> Vector | None:
+    def _trusted_field(self, field: Vector | None) -> Vector | None:
         """The magnetometer's reading, if it is as strong as the world's field."""
-        field = _vector(magnetometer)
         if field is None:
             return None
         excess = abs(math.sqrt(dot(field, field)) - self._field)
@@ -189,6 +202,10 @@ class Estimator:
             self.counts["stale_fix"] += 1
             return
         self._fix_stamp = stamp
+        self._watch.see("position_fix", tuple(fix), stamp)
+        if self._watch.silence("position_fix", stamp) >= self.config.hold_after:
+            self.counts["position_fix_frozen"] += 1
+            return
         then = self._position_at(stamp)
         miss = (fix[0] - then[0], fix[1] - then[1])
         variance = self.config.fix_sigma**2
@@ -241,11 +258,25 @@ class Estimator:
         if self._rejected[sensor] < patience or not agrees:
             return False
         self.counts[f"{sensor}_reinit"] += 1
+        self._restarts += sensor in ("position_fix", "magnetometer")
         return True
+
+    def _trust(self) -> tuple[Trust, str]:
+        """What the estimate is good for, judged by the sensor that has been silent for too long."""
+        config = self.config
+        limits = dict.fromkeys(VECTOR_SENSORS, (config.hold_after, config.lost_after))
+        worst, why = Trust.GOOD, ""
+        for name, (hold, lost) in (limits | {"position_fix": (config.fix_hold_after, config.fix_lost_after)}).items():
+            silence = self._watch.silence(name, self._stamp)
+            trust = Trust.LOST if silence >= lost else Trust.HOLD if silence >= hold else Trust.GOOD
+            if trust > worst:
+                worst, why = trust, f"{name} says nothing new for {silence:.2f} s"
+        return worst, why
 
     def _estimate(self) -> Estimate:
         x, y, yaw, ahead, aside, bias = self._filter.x.tolist()
         cos, sin = math.cos(yaw), math.sin(yaw)
+        trust, why = self._trust()
         return Estimate(
             stamp=self._stamp,
             pose=np.array([x, y, yaw]),
@@ -253,6 +284,9 @@ class Estimator:
             covariance=self._filter.P.copy(),
             upright=self._tilt.up[2],
             yaw_rate=self._yaw_rate - bias,
+            trust=trust,
+            why=why,
+            restarts=self._restarts,
         )
 
 

@@ -1,0 +1,92 @@
+"""Which sensors still say something new, and which have gone silent or repeat themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+Reading = tuple[float, ...]
+
+STIR, LEAP = 0.5, 8.0
+"""Changes of a reading, in standard deviations: that noise causes within moments, and that only motion causes."""
+LEARN = 10
+"""Readings without repetition after which a sensor is known to be noisy."""
+REPEATS = 3
+"""Repetitions in a row, while nothing else changes either, that a noisy sensor never shows."""
+
+
+@dataclass
+class _Sensor:
+    sigma: float
+    value: Reading
+    seen: float
+    new: float
+    changes: int = 0
+    repeats: int = 0
+    repeats_itself: bool = False
+    stir_from: Reading = ()
+    stirred: float = -math.inf
+    leap_from: Reading = ()
+    leapt: float = -math.inf
+
+
+class SensorWatch:
+    """Remembers when each sensor last said something new.
+
+    Noise makes a sensor differ from one reading to the next. One that has done so, then repeats itself to the bit
+    under fresh stamps while others go on changing, is frozen. A reading of nothing but zeros is what wheel encoders
+    say at rest; it is frozen only once another sensor has changed as only motion changes it. A sensor that repeats
+    itself in health, being coarse or without noise, is not judged: what it says wrong is for the gates to find.
+    """
+
+    def __init__(self, sigma: Mapping[str, float]) -> None:
+        """
+        Args:
+            sigma: standard deviation of each sensor's noise, in its own unit.
+        """
+        self._sigma = dict(sigma)
+        self._sensors: dict[str, _Sensor] = {}
+
+    def see(self, name: str, value: Reading | None, stamp: float) -> None:
+        """Take note of a reading, None where there was none, at `stamp` [s]."""
+        if value is None:
+            return
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            new = _Sensor(self._sigma[name], value, stamp, stamp, stir_from=value, leap_from=value)
+            self._sensors[name] = new
+            return
+        sensor.seen = stamp
+        if value == sensor.value:
+            sensor.repeats += 1
+            return
+        if sensor.repeats >= REPEATS and (sensor.changes < LEARN or not self._others_moved(name, sensor.new, STIR)):
+            sensor.repeats_itself = True
+        sensor.changes += 1
+        sensor.repeats = 0
+        sensor.value, sensor.new = value, stamp
+        if math.dist(value, sensor.stir_from) > STIR * sensor.sigma:
+            sensor.stir_from, sensor.stirred = value, stamp
+        if math.dist(value, sensor.leap_from) > LEAP * sensor.sigma:
+            sensor.leap_from, sensor.leapt = value, stamp
+
+    def silence(self, name: str, stamp: float) -> float:
+        """For how long a sensor has said nothing new [s]; 0 for one that has never been heard of."""
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            return 0.0
+        return stamp - (sensor.new if self.frozen(name) else sensor.seen)
+
+    def frozen(self, name: str) -> bool:
+        """Whether a sensor that should not repeat itself does, while others change."""
+        sensor = self._sensors[name]
+        if sensor.repeats < REPEATS or sensor.changes < LEARN or sensor.repeats_itself:
+            return False
+        return self._others_moved(name, sensor.new, STIR if any(sensor.value) else LEAP)
+
+    def _others_moved(self, name: str, since: float, size: float) -> bool:
+        for other, sensor in self._sensors.items():
+            if other != name and (sensor.stirred if size == STIR else sensor.leapt) > since:
+                return True
+        return False
