@@ -1,0 +1,80 @@
+"""A sensor that repeats its value under fresh stamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from runtime_motion import estimator_for, follow, frames, recorded
+
+from hiernav.runtime.estimator import Trust
+from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
+
+BEGIN = 1.5
+
+
+def freeze(sensor: str, begin: float = BEGIN, end: float = 99.0):
+    last: list[np.ndarray] = []
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        value = getattr(frame, sensor)
+        if value is None:
+            return frame
+        if frame.stamp < begin or not last:
+            last[:] = [value]
+        return replace(frame, **{sensor: last[0]}) if frame.stamp < end else frame
+
+    return damage
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("sensor", VECTOR_SENSORS)
+def test_a_frozen_sensor_asks_to_hold_within_half_a_second(robot, sensor):
+    motion = recorded(robot)
+    estimator = estimator_for(motion)
+    errors = follow(motion, estimator, frames(motion), freeze(sensor))
+    held = next(each for each in errors.estimates if each.trust is not Trust.GOOD)
+    assert BEGIN < held.stamp <= BEGIN + 0.5
+    assert held.why.startswith(f"{sensor} says nothing new")
+    assert estimator.counts[f"{sensor}_frozen"] > 0
+    assert errors.estimates[-1].trust is Trust.LOST
+
+
+def test_a_sensor_that_thaws_is_trusted_again():
+    motion = recorded("car")
+    errors = follow(motion, estimator_for(motion), frames(motion), freeze("gyro", end=BEGIN + 0.5))
+    assert any(each.trust is Trust.HOLD for each in errors.estimates)
+    assert all(each.trust is Trust.GOOD for each in errors.estimates if each.stamp > BEGIN + 0.6)
+
+
+def test_a_frozen_position_fix_is_not_driven_on():
+    motion = recorded("point")
+    errors = follow(motion, estimator_for(motion), frames(motion), freeze("position_fix"))
+    nominal = follow(motion, estimator_for(motion), frames(motion))
+    soon = round(1.0 / motion.stamps[1])
+    at = round(BEGIN / motion.stamps[1])
+    assert np.abs(errors.position[at : at + soon]).max() < 0.15
+    assert nominal.position[at : at + soon].max() < 0.06
+    assert any(each.trust is Trust.HOLD and "position_fix" in each.why for each in errors.estimates)
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("noise", [1.0, 0.0])
+def test_healthy_sensors_are_never_taken_for_frozen_with_noise_and_without(robot, noise):
+    motion = recorded(robot)
+    for seed in range(3):
+        errors = follow(motion, estimator_for(motion), frames(motion, seed, noise=noise))
+        assert all(each.trust is Trust.GOOD for each in errors.estimates)
+
+
+def test_wheel_encoders_that_say_zero_at_rest_are_not_frozen():
+    motion = recorded("point")
+    still = {name: np.repeat(values[:1], len(values), 0) for name, values in motion.sensors.items()}
+    rest = replace(motion, sensors=still, poses=np.repeat(motion.poses[:1], len(motion.poses), 0))
+
+    def encoders(frame: SensorFrame) -> SensorFrame:
+        return replace(frame, velocimeter=np.zeros(3) if frame.stamp > 0.5 else frame.velocimeter)
+
+    errors = follow(rest, estimator_for(motion), frames(rest), encoders)
+    assert all(each.trust is Trust.GOOD for each in errors.estimates)
