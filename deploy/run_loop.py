@@ -29,11 +29,11 @@ from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.observe import Observer, TickRecord
+from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.sim_robot import EXACT, SensorNoise, SimRobot
 from hiernav.runtime.summary import Episode, print_summary, summarise
-from hiernav.runtime.supervisor import Mode
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.worlds import sample_layout
@@ -129,7 +129,7 @@ def _run(arguments: argparse.Namespace) -> int:
     guard = Guard(spec.action_dim, GuardConfig(slew_limit=bundle.manifest.guard.slew_limit, tilt_limit=tilt_limit))
     driver = Driver(
         robot,
-        make_agent(bundle, spec.radius, GOAL_RADIUS),
+        Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS)),
         robot.occupancy,
         clock,
         Estimator(EstimatorConfig(tilts=spec.free_base)),
@@ -143,12 +143,10 @@ def _run(arguments: argparse.Namespace) -> int:
     console, episodes, drives = Console(), [], []
     for layout in layouts:
         robot.reset(layout, layout.seed)
-        if (
-            driver.supervisor.mode is Mode.FAULT
-        ):  # a simulated robot is as good as new; a real one is for people to look at
+        if driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people to look at
             driver.supervisor.acknowledge(clock.now())
         drive = Drive(robot)
-        driver.observers = [drive]
+        driver.audience.observers = [drive]
         result = driver.run(layout.goal)
         truth = robot.truth()
         distance = float(np.linalg.norm(truth.pose[:2] - layout.goal))

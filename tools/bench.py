@@ -164,6 +164,7 @@ def bench_tick(arguments: argparse.Namespace) -> dict[str, Any]:
     from hiernav.runtime.clock import FakeClock
     from hiernav.runtime.driver import Driver
     from hiernav.runtime.estimator import Estimator, EstimatorConfig
+    from hiernav.runtime.pilot import Pilot
     from hiernav.runtime.policy import make_agent
     from hiernav.runtime.sim_robot import SimRobot
     from hiernav.sim.layout import parse_world
@@ -176,7 +177,7 @@ def bench_tick(arguments: argparse.Namespace) -> dict[str, Any]:
     robot = SimRobot(spec, layouts[0])
     driver = Driver(
         robot,
-        make_agent(bundle, spec.radius),
+        Pilot(make_agent(bundle, spec.radius)),
         robot.occupancy,
         FakeClock(),
         Estimator(EstimatorConfig(tilts=spec.free_base)),

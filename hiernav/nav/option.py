@@ -118,6 +118,14 @@ class Planner(Protocol):
         ...
 
 
+class DeferredPlanner(Protocol):
+    """A planner that may work elsewhere, such as in a process of its own."""
+
+    def plan(self, query: PlanQuery) -> np.ndarray | None:
+        """As `Planner.plan`; None if the plans will be handed to `WaypointOption.adopt` at a later step."""
+        ...
+
+
 @dataclass
 class OptionStep:
     """Outcome of one control step of `WaypointOption`."""
@@ -128,6 +136,8 @@ class OptionStep:
     """(N, K, 2) active plan, world frame [m]."""
     start: np.ndarray
     """(N, 2) position it was made from [m]."""
+    replanned: np.ndarray
+    """(N,) bool, whether the plan is another one than at the last step."""
     plan_seconds: float = 0.0
     """Time the planner took."""
 
@@ -137,10 +147,11 @@ class WaypointOption:
     """Plans of N robots: when each one ends, a new one is asked for.
 
     A row whose planner finds nothing (NaN) or nonsense, or whose position is not finite, keeps the plan it has, or
-    holds its position if it has none, and asks again at the next step; such refusals are counted.
+    holds its position if it has none, and asks again at the next step; such refusals are counted. So does a row whose
+    planner works elsewhere, with its newest state at every step, until `adopt` brings the plan.
     """
 
-    planner: Planner
+    planner: Planner | DeferredPlanner
     num_rows: int
     rule: ReplanRule = field(default_factory=ReplanRule)
     num_waypoints: int = 10
@@ -160,6 +171,9 @@ class WaypointOption:
         self.visits: list[VisitMap | None] = [None] * self.num_rows
         self.counts = np.zeros((self.num_rows, len(TerminationReason)), dtype=np.int64)
         self.refused = np.zeros(self.num_rows, dtype=np.int64)
+        self.waiting = np.zeros(self.num_rows, dtype=bool)
+        """Whether a plan has been asked for that is to be brought by `adopt`."""
+        self._adopted = np.zeros(self.num_rows, dtype=bool)
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
@@ -171,12 +185,36 @@ class WaypointOption:
         self.plan[rows], self.start[rows] = np.nan, np.nan
         self.started[rows], self.age[rows] = False, 0
         self.counts[rows], self.refused[rows] = 0, 0
+        self.waiting[rows] = self._adopted[rows] = False
         for row in rows.tolist():
             self.visits[row] = None
 
-    def drop(self, rows: np.ndarray | None = None) -> None:
+    def drop(self, rows: np.ndarray | slice | None = None) -> None:
         """Give up the plans of some rows without forgetting the episode, as when the goal has changed."""
-        self.started[slice(None) if rows is None else rows] = False
+        rows = slice(None) if rows is None else rows
+        self.started[rows] = self.waiting[rows] = self._adopted[rows] = False
+
+    def adopt(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> bool:
+        """Follow a plan that was asked for at an earlier step, from the next step on.
+
+        Args:
+            row: whose plan it is.
+            plan: (K, 2) world frame [m]; NaN says that none was found.
+            start: (2,) position it was made from [m].
+            occupancy: map it was made on.
+
+        Returns:
+            Whether the plan is accepted; if not the refusal is counted, and the row still waits.
+        """
+        if plan.shape != self.plan[row].shape:
+            raise ValueError(f"planner returned shape {plan.shape}, expected {self.plan[row].shape}")
+        if not (np.abs(plan - start) <= self.max_reach).all():
+            self.refused[row] += 1
+            return False
+        self._follow(row, plan, start, occupancy)
+        self.started[row] = self._adopted[row] = True
+        self.waiting[row] = False
+        return True
 
     def step(
         self,
@@ -205,12 +243,18 @@ class WaypointOption:
             visits.add(where)
         self.age[rows] += 1
         reason = self._reasons(rows, position, goal, occupancy)
+        ended = (reason != _NONE) & (reason != _GOAL)
+        # a plan that is waited for has ended once, however often it is asked for
+        waiting = self.waiting[rows]
+        due = np.flatnonzero(ended | (waiting & (reason != _GOAL)))
+        reason[waiting & ended] = _NONE
         self.counts[rows, reason] += 1
-        due = np.flatnonzero((reason != _NONE) & (reason != _GOAL))
+        replanned = self._adopted[rows]
+        self._adopted[rows] = False
         began = time.perf_counter()
         if len(due):
-            self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
-        return OptionStep(reason, self.plan[rows], self.start[rows], time.perf_counter() - began)
+            replanned[due] |= self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
+        return OptionStep(reason, self.plan[rows], self.start[rows], replanned, time.perf_counter() - began)
 
     def line(self) -> np.ndarray:
         """(N, K + 1, 2) active plans with the position they were made from in front."""
@@ -247,9 +291,11 @@ class WaypointOption:
 
     def _replan(
         self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
-    ) -> None:
+    ) -> np.ndarray:
+        """Ask for plans of some rows; (M,) bool, which of them have a new one."""
         plan = np.full((len(rows), self.num_waypoints, 2), np.nan)
         known = np.flatnonzero(np.isfinite(position).all(axis=1) & np.isfinite(goal).all(axis=1))
+        later = np.zeros(len(rows), dtype=bool)
         if len(known):
             visits = [self.visits[row] for row in rows[known].tolist()]
             query = PlanQuery(
@@ -259,22 +305,28 @@ class WaypointOption:
                 visits=[v for v in visits if v is not None],
                 previous=np.where(self.started[rows[known]][:, None, None], self.plan[rows[known]], np.nan),
             )
-            proposed = np.asarray(self.planner.plan(query), dtype=np.float64)
-            if proposed.shape != plan[known].shape:
-                raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
-            plan[known] = proposed
+            answer = self.planner.plan(query)
+            if answer is None:
+                later[known] = True
+            else:
+                proposed = np.asarray(answer, dtype=np.float64)
+                if proposed.shape != plan[known].shape:
+                    raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
+                plan[known] = proposed
+        self.waiting[rows] = later
         # not "> max_reach", so that NaN is refused too
         good = (np.abs(plan - position[:, None]) <= self.max_reach).all(axis=(1, 2))
-        self.refused[rows[~good]] += 1
+        self.refused[rows[~good & ~later]] += 1
         hold = ~good & ~np.isfinite(self.plan[rows]).all(axis=(1, 2))
         plan[hold] = position[hold][:, None]
-        accepted = good | hold
-        self.plan[rows[accepted]] = plan[accepted]
-        self.start[rows[accepted]] = position[accepted]
+        for k in np.flatnonzero(good | hold).tolist():
+            self._follow(int(rows[k]), plan[k], position[k], occupancy[k])
         self.started[rows[good]] = True
-        self.age[rows[accepted]] = 0
-        for k in np.flatnonzero(accepted).tolist():
-            self._swept[rows[k]], self._planned_on[rows[k]] = None, occupancy[k]
+        return good
+
+    def _follow(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> None:
+        self.plan[row], self.start[row], self.age[row] = plan, start, 0
+        self._swept[row], self._planned_on[row] = None, occupancy
 
 
 @dataclass
@@ -303,8 +355,8 @@ class AgentStep:
 
     @property
     def replanned(self) -> np.ndarray:
-        """(N,) bool."""
-        return (self.reason != _NONE) & (self.reason != _GOAL)
+        """(N,) bool, whether the plan is another one than at the last step."""
+        return self.option.replanned
 
     @property
     def plan_seconds(self) -> float:

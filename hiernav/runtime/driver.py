@@ -1,79 +1,65 @@
-"""Drives one robot to one goal at a time: read, estimate, plan, infer, guard, send."""
+"""Drives one robot to its goals: read, estimate, decide, guard, send; and waits, recovers or stops when it must."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from hiernav.nav.goal import GoalRefused, place_goal
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import Clock
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.collision import time_to_collision
+from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig, Trust
 from hiernav.runtime.guard import Guard
-from hiernav.runtime.loop import FixedRateLoop, LoopExit
-from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
+from hiernav.runtime.observe import Audience, Observer, TickRecord
+from hiernav.runtime.pilot import Decision, Pilot
 from hiernav.runtime.robot import Robot, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
 from hiernav.runtime.timing import TickTimer
+from hiernav.runtime.trip import RunResult, Trip
+from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, PlanWatch, SaturationWatch, StopWatch
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
-
 FLUSH_SECONDS = 1.0
 """What observers are given to bring their data to safety once the robot is braked [s]."""
 
 log = logging.getLogger(__name__)
 
 
-class Decision(Protocol):
-    """What the driver needs of an agent's step; each array has one row."""
-
-    @property
-    def action(self) -> np.ndarray: ...
-    @property
-    def reason(self) -> np.ndarray: ...
-    @property
-    def plan(self) -> np.ndarray: ...
-    @property
-    def replanned(self) -> np.ndarray: ...
-    @property
-    def plan_seconds(self) -> float: ...
-    @property
-    def observation(self) -> np.ndarray: ...
-    @property
-    def proposed(self) -> np.ndarray: ...
-    @property
-    def start(self) -> np.ndarray: ...
-
-
-class Agent(Protocol):
-    """Planner and skill, such as `hiernav.nav.option.HierarchicalAgent` with one row."""
-
-    def reset(self) -> None: ...
-
-    def act(
-        self, pose: np.ndarray, terms: Mapping[str, np.ndarray], goal: np.ndarray, occupancy: Sequence[OccupancyMap]
-    ) -> Decision: ...
-
-
 @dataclass(frozen=True)
 class DriverConfig:
-    """When a run ends."""
+    """When a robot waits, when it gives up, and when a run ends."""
 
     goal_radius: float = 0.3
     """The goal is reached within this distance of the estimated position [m]."""
+    goal_tolerance: float = 0.3
+    """A goal inside an obstacle may be moved this far to a free point [m]."""
+    robot_radius: float = 0.1
+    """Disc that must not meet the map [m]."""
     max_steps: int = 300
     """Control steps after which a run ends by timeout."""
-    blind_timeout: float = 2.0
-    """Without a fresh estimate for this long, at the start or while running, the run ends in a fault [s]."""
-    blind_ticks: int = 5
-    """An estimate that has not changed for more control periods than this is not driven on."""
+    first_estimate: float = 2.0
+    """Time the sensors are given to tell position and heading, once there is a goal [s]."""
+    no_way_at_start: float = 1.5
+    """Time a planner is given to find a first plan, if it says that there is no way [s]."""
+    no_way_hold: float = 0.3
+    """Time without a way after which a robot under way waits [s]."""
+    no_way: float = 10.0
+    """Time without a way after which a goal that was driven to counts as unreachable [s]."""
+    plan_slow: float = 0.3
+    """A robot whose plan has ended this long ago, with no new one, slows down [s]."""
+    plan_hold: float = 1.0
+    """A robot whose plan has ended this long ago waits [s]."""
+    hold_timeout: float = 10.0
+    """Waiting longer than this is a fault, unless somebody paused the robot [s]."""
     stop_speed: float = 0.1
     """A robot slower than this, three readings in a row, has stopped [m/s]."""
     stop_timeout: float = 3.0
@@ -83,45 +69,22 @@ class DriverConfig:
         for name, value in self.__dict__.items():
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"DriverConfig.{name} = {value} must be finite and positive")
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """How a run ended."""
-
-    reason: str
-    """goal, left_field, timeout, fault or interrupted."""
-    steps: int
-    """Control steps driven."""
-    seconds: float
-    """Time they took on the robot's clock [s]."""
-    distance: float
-    """From the last estimated position to the goal [m]; NaN if there was no estimate."""
-    stopped: bool
-    """Whether the measured speed showed that the robot stands."""
-    fault: str | None = None
-    replans: Mapping[str, int] = field(default_factory=dict)
-    """New plans by termination reason."""
-    guard: Mapping[str, int] = field(default_factory=dict)
-    """How often the guard acted, by kind."""
-    estimator: Mapping[str, int] = field(default_factory=dict)
-    """What the estimator dropped or rejected, by kind."""
-
-    @property
-    def reached(self) -> bool:
-        return self.reason == "goal"
+        if not self.plan_slow < self.plan_hold:
+            raise ValueError(f"DriverConfig.plan_slow = {self.plan_slow} must be less than plan_hold")
 
 
 class Driver:
     """Ties robot, estimator, agent and guard together, one tick at a time.
 
-    The robot is braked on every way out of `run`, and the stop is verified from its measured speed.
+    `run` drives to one goal, `serve` waits for goals. The robot is braked on every way out of either, and the stop is
+    verified from its measured speed. Everything else that is public may be called from any thread while they run; it
+    takes effect at the beginning of the next tick.
     """
 
     def __init__(
         self,
         robot: Robot,
-        agent: Agent,
+        pilot: Pilot,
         occupancy: Callable[[float], OccupancyMap],
         clock: Clock,
         estimator: Estimator | None = None,
@@ -133,23 +96,30 @@ class Driver:
         """
         Args:
             robot: what is driven.
-            agent: planner and skill.
+            pilot: planner and skill.
             occupancy: the known map at a stamp of the robot's clock [s]; the same object while nothing has moved.
             clock: paces the loop.
             estimator, guard, config, timer: defaults if None.
             observers: told of every tick and event; one that raises is dropped.
         """
-        self.robot, self.agent, self.occupancy, self.clock = robot, agent, occupancy, clock
+        self.robot, self.pilot, self.occupancy, self.clock = robot, pilot, occupancy, clock
         self.estimator = estimator or Estimator()
         self.guard = guard or Guard(robot.action_dim)
         self.config = config or DriverConfig()
         self.timer = timer or TickTimer(SECTIONS)
+        self.audience = Audience(observers)
         self.supervisor = Supervisor(lambda now, mode, why: self._emit("mode", why, now, mode=mode.value))
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
-        self.observers = list(observers)
-        self._truth: Callable[[], Truth] | None = getattr(robot, "truth", None)
         self.interrupted = False
         """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
+        self.last_result: RunResult | None = None
+        """Of the goal that ended last."""
+        self._truth: Callable[[], Truth] | None = getattr(robot, "truth", None)
+        self._requests: deque[Callable[[float], None]] = deque()
+        self._trip: Trip | None = None
+        self._ended: Trip | None = None
+        self._estimate: Estimate | None = None
+        self._paused = self._serving = False
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -158,131 +128,318 @@ class Driver:
             ValueError: the goal is not two finite numbers.
             InvalidTransition: the last fault has not been acknowledged.
         """
-        self.goal = np.array(goal, dtype=np.float64)
-        if self.goal.shape != (2,) or not np.isfinite(self.goal).all():
-            raise ValueError(f"Driver.run: goal {goal} must be two finite coordinates [m]")
-        if self.supervisor.mode is not Mode.INIT:
-            self.supervisor.change(Mode.INIT, "new run", self.clock.now())
-        self._max_steps = max_steps or self.config.max_steps
-        self._steps = 0
-        self._reason: str | None = None
-        self._estimate: Estimate | None = None
-        self._began_at: float | None = None
-        self._last_stamp = 0.0
-        self._fresh_at: float | None = None
-        self._fresh_stamp = -math.inf
-        self._terms = TermHold()
-        self._plan_stamp: float | None = None
-        self._replans: Counter[str] = Counter()
-        self._emit("goal", f"{self.goal[0]:g}, {self.goal[1]:g}", self.clock.now(), x=self.goal[0], y=self.goal[1])
-        self.agent.reset()
-        self.guard.reset()
-        self.estimator.reset()
-        _warm_up(self.estimator.config)
-        guard_before, estimator_before = self.guard.counts.copy(), self.estimator.counts.copy()
+        goal = _checked_goal(goal)
+        self._begin()
+        self._start_trip(goal, max_steps, self.clock.now())
+        self._serving = False
+        self._loop()
+        assert self.last_result is not None
+        return self.last_result
 
-        self.interrupted = self.loop.run() is LoopExit.INTERRUPTED
-        if self.interrupted:
-            self._reason = "interrupted"
-        reason = self._reason or "interrupted"
-        self._tell(lambda observer: observer.flush(FLUSH_SECONDS))
-        stopped = self._stop()
-        if self.supervisor.mode is not Mode.FAULT:
-            self.supervisor.change(Mode.STOPPED, reason, self.clock.now())
-        self._emit("end", reason, self.clock.now(), steps=self._steps, stopped=stopped)
-        position = self._estimate.pose[:2] if self._estimate is not None else np.full(2, np.nan)
-        return RunResult(
-            reason=reason,
-            steps=self._steps,
-            seconds=0.0 if self._began_at is None else self._last_stamp - self._began_at,
-            distance=float(np.linalg.norm(position - self.goal)),
-            stopped=stopped,
-            fault=self.supervisor.fault,
-            replans=dict(self._replans),
-            guard=dict(self.guard.counts - guard_before),
-            estimator=dict(self.estimator.counts - estimator_before),
-        )
+    def serve(self) -> None:
+        """Stay ready for goals (`set_goal`), until `quit`, SIGINT or SIGTERM. Faults are waited out, not raised."""
+        self._begin()
+        self._serving = True
+        self._loop()
+
+    def set_goal(self, goal: np.ndarray, max_steps: int | None = None) -> None:
+        """Drive to `goal` (2,), world frame [m], instead of to the present one if there is one.
+
+        Raises:
+            ValueError: the goal is not two finite numbers.
+        """
+        goal = _checked_goal(goal)
+        self._requests.append(lambda now: self._start_trip(goal, max_steps, now))
+
+    def cancel(self) -> None:
+        """Give up the present goal, and stop."""
+        self._requests.append(lambda now: self._end_trip("cancelled", now))
+
+    def pause(self) -> None:
+        """Wait, braked, until `resume`."""
+        self._requests.append(lambda now: setattr(self, "_paused", True))
+
+    def resume(self) -> None:
+        """Go on after `pause`."""
+        self._requests.append(lambda now: setattr(self, "_paused", False))
+
+    def estop(self, why: str = "emergency stop") -> None:
+        """Brake, and stay braked until `acknowledge`."""
+        self._requests.append(lambda now: self._estop(why, now))
+
+    def acknowledge(self) -> None:
+        """The cause of a fault or of an emergency stop is gone. The robot does not move before it gets a goal."""
+        self._requests.append(self._acknowledge)
+
+    def quit(self) -> None:
+        """End `run` or `serve` after the present tick."""
+        self.loop.stop()
+
+    @property
+    def goal(self) -> np.ndarray | None:
+        """(2,) the present goal, world frame [m]."""
+        return None if self._trip is None else self._trip.goal
+
+    def _begin(self) -> None:
+        now = self.clock.now()
+        if self.supervisor.mode is not Mode.INIT:
+            self.supervisor.change(Mode.INIT, "new run", now)
+        self._requests.clear()
+        self._trip, self._ended, self._paused = None, None, False
+        self._estimate, self._restarts = None, 0
+        self._last_frame: SensorFrame | None = None
+        self._loop_ticks = self.loop.ticks
+        self._terms = TermHold()
+        config, trust = self.config, self.estimator.config
+        self._blind = BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate)
+        self._overruns = OverrunWatch()
+        self._plans = PlanWatch(config.plan_slow, config.plan_hold)
+        self._no_way = BlockedWatch(0.0, config.no_way_at_start)
+        self._saturation = SaturationWatch(self.robot.action_dim, self.robot.control_period)
+        self._standing = StopWatch(config.stop_speed, config.stop_timeout)
+        self.estimator.reset()
+        self.last_result = None
+        _warm_up(self.estimator.config)
+
+    def _loop(self) -> None:
+        """Tick until done, brake, save what was observed, and make sure that the robot stands."""
+        self.interrupted = False
+        with noting_signals(lambda: setattr(self, "interrupted", True)):
+            self.interrupted |= self.loop.run() is LoopExit.INTERRUPTED
+            if self._trip is not None:
+                self._end_trip("interrupted", self.clock.now())
+            self.audience.tell(lambda observer: observer.flush(FLUSH_SECONDS))
+            stopped = self._stop()
+            if self._ended is not None:
+                self.last_result = self._result(self._ended, stopped)
+            if not self.supervisor.latched and self.supervisor.mode is not Mode.INIT:
+                self.supervisor.change(Mode.INIT, "the loop has ended", self.clock.now())
 
     def _tick(self, now: float) -> bool:
         """One control step; True when the run is over. What goes wrong in it is a fault, not an exception."""
         try:
-            return self._step(now)
+            self._step(now)
         except Exception as error:
             log.exception("control step failed")
             self._fail(f"{type(error).__name__}: {error}", now)
-            return True
+            self.robot.brake()
+        return not self._serving and self._trip is None
 
-    def _step(self, now: float) -> bool:
-        timer = self.timer
+    def _step(self, now: float) -> None:
+        timer, supervisor = self.timer, self.supervisor
         timer.begin()
-        frame = self.robot.read()
-        truth = self._truth() if self._truth is not None and self.observers else None
-        self._last_stamp = frame.stamp
+        frame = self._last_frame = self.robot.read()
+        truth = self._truth() if self._truth is not None and self.audience else None
         timer.mark("read")
         self._estimate = estimate = self.estimator.update(frame)
         timer.mark("estimate")
-        if self._is_blind(estimate, now) or estimate is None:
+        while self._requests:
+            self._requests.popleft()(now)
+        trust, doubt = self._blind.check(estimate, now)
+        late = self._overruns.check(self.loop.overruns_in_a_row)
+        occupancy = decision = sent = None
+        scale = 1.0
+        if self._trip is not None:
+            self._trip.last = frame.stamp
+        if trust is Trust.LOST and self._trip is not None:
+            self._fail(doubt, now)
+        if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
+            occupancy = self.occupancy(frame.stamp)
+            self._get_ready(estimate, occupancy, now)
+            if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
+                decision = self._decide(self._trip, frame, estimate, occupancy, now)
+        elif supervisor.mode in (Mode.READY, Mode.ARMED):
+            supervisor.change(Mode.INIT, doubt, now)
+        if self._trip is not None and not supervisor.latched:
+            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else late, frame.stamp, now)
+        if supervisor.driving and decision is not None and estimate is not None and occupancy is not None:
+            sent, scale = self._send(decision, estimate, occupancy, now)
+        if sent is None:
             self.robot.brake()
             timer.mark("send")
-            self._finish_tick(now, frame, truth, estimate, None, None, None)
-            return self._reason is not None
-        if self.supervisor.mode is not Mode.RUNNING:
-            self._start(frame.stamp, now)
-        occupancy = self.occupancy(frame.stamp)
-        if self._is_over(estimate, occupancy):
-            self._finish_tick(now, frame, truth, estimate, occupancy, None, None)
-            return True
+            self._check_stop(estimate, now)
+        timer.end()
+        if self.audience:
+            self._show(now, frame, truth, estimate, occupancy, decision, sent, scale)
 
-        decision = self.agent.act(estimate.pose[None], self._terms.fill(frame), self.goal[None], [occupancy])
-        if bool(decision.replanned[0]):
-            self._replans[TerminationReason(int(decision.reason[0])).name.lower()] += 1
-            self._plan_stamp = estimate.stamp
-            timer.mark_split("infer", "plan", float(decision.plan_seconds))
+    def _get_ready(self, estimate: Estimate, occupancy: OccupancyMap, now: float) -> None:
+        """INIT -> READY -> ARMED, as far as there is a goal that can be driven to."""
+        supervisor, trip = self.supervisor, self._trip
+        if supervisor.mode is Mode.INIT:
+            supervisor.change(Mode.READY, "position and heading known", now)
+            self._restarts = estimate.restarts
+        if supervisor.mode is Mode.READY and trip is not None and not self._paused:
+            try:
+                trip.goal = place_goal(occupancy, estimate.pose[:2], trip.goal, self.config.goal_tolerance)
+            except GoalRefused as refusal:
+                self._end_trip(refusal.code, now, str(refusal))
+                return
+            supervisor.change(Mode.ARMED, f"goal {trip.goal[0]:g}, {trip.goal[1]:g}", now)
+        if estimate.restarts != self._restarts:
+            self._restarts = estimate.restarts
+            self._emit("plan", "the position was found anew: the plan is void", now)
+            self.pilot.drop()
+
+    def _is_over(self, trip: Trip, estimate: Estimate, occupancy: OccupancyMap, now: float) -> bool:
+        position = estimate.pose[:2]
+        trip.distance = math.dist(position, trip.goal)
+        if trip.distance <= self.config.goal_radius:
+            self._end_trip("goal", now)
+        elif not occupancy.contains(position):
+            self._end_trip("left_field", now)
+        elif trip.steps >= trip.max_steps:
+            self._end_trip("timeout", now)
+        return self._trip is None
+
+    def _decide(
+        self, trip: Trip, frame: SensorFrame, estimate: Estimate, occupancy: OccupancyMap, now: float
+    ) -> Decision:
+        if not self.supervisor.driving:
+            self.pilot.rest()
+        decision = self.pilot.act(now, estimate, self._terms.fill(frame), trip.goal, occupancy)
+        if decision.reason is not TerminationReason.NONE:
+            trip.replans[decision.reason.name.lower()] += 1
+            self.timer.mark_split("infer", "plan", decision.plan_seconds)
         else:
-            timer.mark("infer")
-        guarded = self.guard.check(decision.action[0], estimate.upright)
-        timer.mark("guard")
-        sent = self.robot.send(guarded.action)
-        timer.mark("send")
-        self._steps += 1
+            self.timer.mark("infer")
+        return decision
+
+    def _choose_mode(self, trip: Trip, decision: Decision | None, wait: str | None, stamp: float, now: float) -> None:
+        """What the robot may do in this tick, `wait` being why it must not move, if so."""
+        supervisor = self.supervisor
+        if self._paused:
+            wait = "paused"
+        self._plan_speed = 1.0
+        if decision is not None:
+            failed = self.pilot.failed
+            if failed is not None:
+                self._fail(failed, now)
+                return
+            self._plan_speed, overdue = self._plans.check(decision.overdue)
+            no_way, give_up = self._no_way.check(decision.refused, now)
+            wait = wait or overdue or no_way or (None if decision.has_plan else "no plan yet")
+            if give_up:
+                self._end_trip("unreachable", now, "the planner finds no way to the goal")
+                return
+            if decision.given_up and supervisor.driving:
+                self._fail(f"stuck: {self.pilot.recoveries} recoveries did not help", now)
+                return
+        if supervisor.mode in (Mode.INIT, Mode.READY, Mode.ARMED):
+            if supervisor.mode is Mode.ARMED and decision is not None and wait is None:
+                supervisor.change(Mode.RUNNING, "first plan", now)
+                trip.began = stamp
+                self._no_way = BlockedWatch(self.config.no_way_hold, self.config.no_way)
+            return
+        if wait is not None:
+            self._hold(trip, wait, now)
+        elif decision is not None:
+            self._drive(trip, decision, now)
+
+    def _hold(self, trip: Trip, why: str, now: float) -> None:
+        if self.supervisor.mode is not Mode.HOLD:
+            self.supervisor.change(Mode.HOLD, why, now)
+            trip.holds[why.split(" for ")[0]] += 1
+            self._held_since = now
+            self._standing.begin(now)
+        elif self._paused:
+            self._held_since = now
+        elif now - self._held_since > self.config.hold_timeout:
+            self._fail(f"held for {self.config.hold_timeout:g} s: {why}", now)
+
+    def _drive(self, trip: Trip, decision: Decision, now: float) -> None:
+        supervisor = self.supervisor
+        if supervisor.mode is Mode.HOLD:
+            supervisor.change(Mode.RUNNING, "nothing to wait for any more", now)
+            self._saturation.reset()
+        if decision.recovering and supervisor.mode is Mode.RUNNING:
+            trip.recoveries += 1
+            supervisor.change(Mode.RECOVERING, f"recovery {trip.recoveries}", now)
+        elif not decision.recovering and supervisor.mode is Mode.RECOVERING:
+            supervisor.change(Mode.RUNNING, "recovery done", now)
+            self.pilot.replan()
+            self._saturation.reset()
+
+    def _send(
+        self, decision: Decision, estimate: Estimate, occupancy: OccupancyMap, now: float
+    ) -> tuple[np.ndarray | None, float]:
+        """Past the guard to the robot; what was sent, None if the robot is to be braked, and how it was slowed."""
+        x, y, _ = estimate.pose.tolist()
+        vx, vy = estimate.velocity.tolist()
+        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.proposed):
+            self.pilot.recover()
+            self._saturation.reset()
+        slow = self.guard.config.slow_ttc
+        ttc = math.inf
+        if slow is not None:
+            ttc = time_to_collision(occupancy, (x, y), (vx, vy), self.config.robot_radius, slow)
+        guarded = self.guard.check(decision.action, estimate.upright, ttc, self._plan_speed)
+        self.timer.mark("guard")
         if guarded.fault is not None:
             self._fail(guarded.fault, now)
-        self._finish_tick(now, frame, truth, estimate, occupancy, decision, sent)
-        return self._reason is not None
+            return None, guarded.scale
+        sent = self.robot.send(guarded.action)
+        self.timer.mark("send")
+        if self._trip is not None:
+            self._trip.steps += 1
+        return sent, guarded.scale
 
-    def _start(self, stamp: float, now: float) -> None:
-        self.supervisor.change(Mode.READY, "position and heading known", now)
-        self.supervisor.change(Mode.ARMED, f"goal {self.goal.tolist()}", now)
-        self.supervisor.change(Mode.RUNNING, "first action", now)
-        self._began_at = stamp
+    def _start_trip(self, goal: np.ndarray, max_steps: int | None, now: float) -> None:
+        """Take on a goal in the place of the present one; the robot keeps moving if the planner answers at once."""
+        if self.supervisor.latched:
+            self._emit("goal", f"refused in {self.supervisor.mode.value}: {self.supervisor.fault}", now)
+            return
+        self._end_trip("changed", now)
+        self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
+        self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps), None
+        self._before = (self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts())
+        self._no_way = BlockedWatch(0.0, self.config.no_way_at_start)
+        self.guard.reset()
+        self.pilot.reset()
+        self._saturation.reset()
 
-    def _is_over(self, estimate: Estimate, occupancy: OccupancyMap) -> bool:
-        position = estimate.pose[:2]
-        if math.dist(position, self.goal) <= self.config.goal_radius:
-            self._reason = "goal"
-        elif not occupancy.contains(position):
-            self._reason = "left_field"
-        elif self._steps >= self._max_steps:
-            self._reason = "timeout"
-        return self._reason is not None
+    def _end_trip(self, reason: str, now: float, detail: str = "") -> None:
+        trip, supervisor = self._trip, self.supervisor
+        self._standing.begin(now)
+        if trip is None:
+            return
+        trip.reason, trip.detail = reason, detail
+        self._trip, self._ended = None, trip
+        if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
+            supervisor.change(Mode.READY, reason, now)
+        self._emit("end", detail or reason, now, reason=reason, steps=trip.steps, seconds=trip.seconds)
 
-    def _is_blind(self, estimate: Estimate | None, now: float) -> bool:
-        """Whether there is no estimate, or one that sensors no longer renew; for too long, that is a fault."""
-        if self._fresh_at is None:
-            self._fresh_at = now
-        if estimate is not None and estimate.stamp > self._fresh_stamp:
-            self._fresh_at, self._fresh_stamp = now, estimate.stamp
-            return False
-        age = now - self._fresh_at
-        if age > self.config.blind_timeout:
-            self._fail(f"no fresh position and heading for {self.config.blind_timeout:g} s", now)
-        return estimate is None or age > self.config.blind_ticks * self.robot.control_period
+    def _check_stop(self, estimate: Estimate | None, now: float) -> None:
+        """Follow a robot that was braked until it stands; one that does not stop is a fault."""
+        stands = self._standing.check(estimate, now)
+        if stands is None:
+            return
+        self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
+        if self._ended is not None and self._serving:
+            self.last_result, self._ended = self._result(self._ended, stands), None
+        if not stands:
+            self._fail(f"the robot does not stop within {self.config.stop_timeout:g} s", now)
 
     def _fail(self, why: str, now: float) -> None:
-        self._reason = "fault"
         self.supervisor.fail(why, now)
+        self._end_trip("fault", now, why)
 
-    def _finish_tick(
+    def _estop(self, why: str, now: float) -> None:
+        self.supervisor.stop(why, now)
+        self._end_trip("estop", now, why)
+
+    def _acknowledge(self, now: float) -> None:
+        if not self.supervisor.latched:
+            return
+        self.supervisor.acknowledge(now)
+        self.guard.reset()
+        self.pilot.renew()
+        config, trust = self.config, self.estimator.config
+        self._blind = BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate)
+
+    def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
+        self.audience.emit(kind, text, now, **values)
+
+    def _show(
         self,
         now: float,
         frame: SensorFrame,
@@ -291,65 +448,74 @@ class Driver:
         occupancy: OccupancyMap | None,
         decision: Decision | None,
         sent: np.ndarray | None,
+        scale: float,
     ) -> None:
-        self.timer.end()
-        if not self.observers:
-            return
+        trip = self._trip or self._ended
+        plan: dict[str, object] = {}
+        if decision is not None and estimate is not None:
+            stamp = decision.plan_stamp
+            plan = {
+                "plan": decision.plan,
+                "plan_start": decision.start,
+                "plan_stamp": stamp,
+                "plan_age": None if stamp is None else estimate.stamp - stamp,
+                "reason": decision.reason,
+                "replanned": decision.replanned,
+                "observation": decision.observation,
+                "proposed": decision.proposed,
+            }
         record = TickRecord(
-            index=self.loop.ticks - 1,
+            index=self.loop.ticks - self._loop_ticks - 1,
             time=now,
             lateness=self.loop.late,
             mode=self.supervisor.mode,
             frame=frame,
-            goal=self.goal,
+            goal=None if trip is None else trip.goal,
             occupancy=occupancy,
             estimate=estimate,
             truth=truth,
             sent=sent,
+            speed_scale=scale,
             timings=self.timer.last,
+            **plan,  # type: ignore[arg-type]
         )
-        if decision is not None and estimate is not None:
-            record = replace(
-                record,
-                plan=decision.plan[0],
-                plan_start=decision.start[0],
-                plan_stamp=self._plan_stamp,
-                plan_age=None if self._plan_stamp is None else estimate.stamp - self._plan_stamp,
-                reason=TerminationReason(int(decision.reason[0])),
-                replanned=bool(decision.replanned[0]),
-                observation=decision.observation[0],
-                proposed=decision.proposed[0],
-            )
-        self._tell(lambda observer: observer.tick(record))
+        self.audience.tell(lambda observer: observer.tick(record))
 
-    def _tell(self, what: Callable[[Observer], None]) -> None:
-        for observer in self.observers[:]:
-            try:
-                what(observer)
-            except Exception:
-                log.exception("observer failed and is dropped")
-                self.observers.remove(observer)
+    def _planner_counts(self) -> Counter[str]:
+        pilot = self.pilot
+        return Counter(rejected=pilot.rejected, late=pilot.late, restarts=pilot.restarts)
 
-    def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
-        if self.observers:
-            event = Event(now, kind, text, values)
-            self._tell(lambda observer: observer.event(event))
+    def _result(self, trip: Trip, stopped: bool) -> RunResult:
+        guard, estimator, planner = self._before
+        return RunResult(
+            reason=trip.reason or "interrupted",
+            steps=trip.steps,
+            seconds=trip.seconds,
+            distance=trip.distance,
+            stopped=stopped,
+            fault=self.supervisor.fault,
+            detail=trip.detail,
+            replans=dict(trip.replans),
+            guard=dict(self.guard.counts - guard),
+            estimator=dict(self.estimator.counts - estimator),
+            holds=dict(trip.holds),
+            recoveries=trip.recoveries,
+            planner=dict(self._planner_counts() - planner),
+        )
 
     def _stop(self) -> bool:
         """Brake until the measured speed shows that the robot stands; False if it could not be shown in time."""
-        ticks = math.ceil(self.config.stop_timeout / self.robot.control_period)
-        slow = 0
+        watch = StopWatch(self.config.stop_speed, self.config.stop_timeout)
+        watch.begin(self.clock.now())
+        stopped: bool | None = None
 
         def tick(now: float) -> bool:
-            nonlocal ticks, slow
-            estimate = self.estimator.update(self.robot.read())
-            speed = math.hypot(*estimate.velocity) if estimate is not None else math.inf
-            slow = slow + 1 if speed < self.config.stop_speed else 0
-            ticks -= 1
-            if slow >= 3 or ticks <= 0:
-                return True
-            self.robot.brake()
-            return False
+            nonlocal stopped
+            self._estimate = self.estimator.update(self.robot.read())
+            stopped = watch.check(self._estimate, now)
+            if stopped is None:
+                self.robot.brake()
+            return stopped is not None
 
         try:
             loop = FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake)
@@ -357,7 +523,14 @@ class Driver:
         except Exception:
             log.exception("the stop could not be verified")
             return False
-        return slow >= 3
+        return bool(stopped)
+
+
+def _checked_goal(goal: np.ndarray) -> np.ndarray:
+    checked = np.array(goal, dtype=np.float64)
+    if checked.shape != (2,) or not np.isfinite(checked).all():
+        raise ValueError(f"Driver: goal {goal} must be two finite coordinates [m]")
+    return checked
 
 
 def _warm_up(config: EstimatorConfig) -> None:

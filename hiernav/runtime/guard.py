@@ -25,6 +25,10 @@ class GuardConfig:
     """Angle of the body's z axis to the vertical that is a fault [rad]; None for a robot that cannot tilt."""
     max_tilted: int = 3
     """Ticks in a row beyond the tilt limit that are a fault."""
+    slow_ttc: float | None = None
+    """Below this time to collision with the known map commands are scaled down in proportion [s]; None never does."""
+    slowed: tuple[int, ...] | None = None
+    """Actuators that are scaled, those that make the robot faster; all if None."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= 0.0 <= self.high):
@@ -33,6 +37,8 @@ class GuardConfig:
             raise ValueError(f"GuardConfig.slew_limit = {self.slew_limit} must be finite and positive, or None")
         if self.tilt_limit is not None and not 0.0 < self.tilt_limit <= math.pi:
             raise ValueError(f"GuardConfig.tilt_limit = {self.tilt_limit} rad must be in (0, pi], or None")
+        if self.slow_ttc is not None and not 0.0 < self.slow_ttc < math.inf:
+            raise ValueError(f"GuardConfig.slow_ttc = {self.slow_ttc} s must be finite and positive, or None")
         for name in ("max_non_finite", "max_tilted"):
             if getattr(self, name) < 1:
                 raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be at least 1")
@@ -46,6 +52,8 @@ class Guarded:
     """(A,) float64, finite and within the limits; zeros are the brake."""
     fault: str | None = None
     """Why the run must end, or None."""
+    scale: float = 1.0
+    """Factor by which the robot was slowed down."""
 
 
 class Guard:
@@ -54,30 +62,37 @@ class Guard:
     def __init__(self, action_dim: int, config: GuardConfig | None = None) -> None:
         """
         Raises:
-            ValueError: `action_dim` is below 1.
+            ValueError: `action_dim` is below 1, or `config.slowed` names an actuator that the robot does not have.
         """
         if action_dim < 1:
             raise ValueError(f"Guard: action_dim {action_dim} must be at least 1")
         self.action_dim = action_dim
         self.config = config or GuardConfig()
         self.counts: Counter[str] = Counter()
-        """How often it acted: non_finite, clipped, slewed, tilted."""
+        """How often it acted: non_finite, clipped, slewed, tilted, slowed, slowed_for_plan."""
         limit = self.config.tilt_limit
+        self._slowed = list(range(action_dim)) if self.config.slowed is None else list(self.config.slowed)
+        if not set(self._slowed) <= set(range(action_dim)):
+            raise ValueError(f"GuardConfig.slowed = {self._slowed}: the robot's actuators are 0 to {action_dim - 1}")
         self._least_upright = -math.inf if limit is None else math.cos(limit)
         self.reset()
 
     def reset(self) -> None:
         """A new run begins from standstill; counts are kept."""
-        self._last = np.zeros(self.action_dim)
+        self._last = [0.0] * self.action_dim
         self._non_finite = 0
         self._tilted = 0
 
-    def check(self, action: np.ndarray, upright: float | None = None) -> Guarded:
+    def check(
+        self, action: np.ndarray, upright: float | None = None, ttc: float = math.inf, speed: float = 1.0
+    ) -> Guarded:
         """Make `action` safe to send.
 
         Args:
             action: (A,) from the policy, possibly garbage.
             upright: z component of the body's z axis; None where it is not known. NaN counts as fallen.
+            ttc: time to collision with the known map [s].
+            speed: factor in [0, 1] by which the robot is to be slowed down for another reason.
         """
         fault = self._tilt_fault(upright)
         if fault is not None:
@@ -88,17 +103,32 @@ class Guard:
         if not np.isfinite(action).all():
             return self._refuse(action)
         self._non_finite = 0
-        limited = np.clip(action, self.config.low, self.config.high)
-        if (limited != action).any():
+        # A handful of numbers: Python's own comparisons take a fraction of numpy's calls.
+        low, high, slew = self.config.low, self.config.high, self.config.slew_limit
+        values = action.tolist()
+        limited = [min(max(value, low), high) for value in values]
+        if limited != values:
             self.counts["clipped"] += 1
-        slew = self.config.slew_limit
+        scale = self._scale(ttc, speed)
+        if scale < 1.0:
+            for k in self._slowed:
+                limited[k] *= scale
         if slew is not None:
-            steady = np.clip(limited, self._last - slew, self._last + slew)
-            if (steady != limited).any():
+            steady = [min(max(v, last - slew), last + slew) for v, last in zip(limited, self._last, strict=True)]
+            if steady != limited:
                 self.counts["slewed"] += 1
             limited = steady
         self._last = limited
-        return Guarded(limited)
+        return Guarded(np.array(limited), scale=scale)
+
+    def _scale(self, ttc: float, speed: float) -> float:
+        if speed < 1.0:
+            self.counts["slowed_for_plan"] += 1
+        slow = self.config.slow_ttc
+        if slow is not None and not ttc >= slow:
+            self.counts["slowed"] += 1
+            speed = min(speed, max(ttc, 0.0) / slow) if ttc == ttc else 0.0
+        return max(speed, 0.0)
 
     def _refuse(self, action: np.ndarray) -> Guarded:
         self.counts["non_finite"] += 1
@@ -124,5 +154,5 @@ class Guard:
 
     def _brake(self) -> np.ndarray:
         # The stop is not slewed; what follows it starts from zero again.
-        self._last = np.zeros(self.action_dim)
-        return self._last
+        self._last = [0.0] * self.action_dim
+        return np.zeros(self.action_dim)

@@ -149,9 +149,29 @@ class FixedRateLoop:
                 self._leaving = True
                 raise Interrupted(signal.Signals(number).name)
 
-        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with _handling(interrupt):
             yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+
+
+@contextmanager
+def noting_signals(note: Callable[[], None]) -> Iterator[None]:
+    """Have SIGINT and SIGTERM call `note` and nothing else, where this is the main thread.
+
+    For what must be brought to its end around a loop: between its last tick and the program's end nothing is to be
+    cut short. A loop that runs inside handles signals in its own way.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with _handling(lambda _number, _frame: note()):
+        yield
+
+
+@contextmanager
+def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,8 @@ from hiernav.nav.option import TerminationReason
 from hiernav.runtime.estimate import Estimate
 from hiernav.runtime.robot import SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ class Event:
     time: float
     """On the loop's clock [s]."""
     kind: str
-    """mode, goal, recovery, planner, guard, fault, stop or end."""
+    """mode, goal, plan, planner, stop or end."""
     text: str
     """For people."""
     values: Mapping[str, float | int | str | bool | None] = field(default_factory=dict)
@@ -91,3 +94,28 @@ class Observer:
 
     def flush(self, timeout: float) -> None:
         """The run is over and the robot braked: bring to safety what was collected, within `timeout` [s]."""
+
+
+class Audience:
+    """All observers of a loop."""
+
+    def __init__(self, observers: Sequence[Observer] = ()) -> None:
+        self.observers = list(observers)
+
+    def __bool__(self) -> bool:
+        return bool(self.observers)
+
+    def tell(self, what: Callable[[Observer], None]) -> None:
+        """Call `what` with each observer; one that raises is dropped."""
+        for observer in self.observers[:]:
+            try:
+                what(observer)
+            except Exception:
+                log.exception("observer failed and is dropped")
+                self.observers.remove(observer)
+
+    def emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
+        """Tell of an event."""
+        if self.observers:
+            event = Event(now, kind, text, values)
+            self.tell(lambda observer: observer.event(event))

@@ -9,8 +9,7 @@ import numpy as np
 import onnxruntime as ort
 
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, TensorSpec
-from hiernav.nav.option import HierarchicalAgent, ReplanRule, WaypointOption
-from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
+from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption
 
 GOLDEN_TOLERANCE = 1e-5
 _DTYPES: dict[str, np.dtype[Any]] = {"tensor(float)": np.dtype(np.float32), "tensor(uint8)": np.dtype(np.uint8)}
@@ -117,24 +116,43 @@ def load_policies(bundle: Bundle) -> Policies:
     return policies
 
 
-def make_agent(bundle: Bundle, robot_radius: float, goal_radius: float = 0.3) -> HierarchicalAgent:
+def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float) -> Planner:
+    """The planner a bundle describes: the network on GOSELO images, verified, and repaired by shortest paths.
+
+    Args:
+        bundle: verified policies.
+        network: of that bundle.
+        robot_radius: disc with which plans are swept against the map [m].
+    """
+    from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner  # takes scipy along
+
+    plan = bundle.manifest.plan
+    return VerifiedPlanner(
+        GoseloPlanner(network, bundle.manifest.goselo.channels, plan.planning_radius_m),
+        ShortestPathPlanner(
+            plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
+        ),
+        robot_radius,
+    )
+
+
+def make_agent(
+    bundle: Bundle, robot_radius: float, goal_radius: float = 0.3, planner: DeferredPlanner | None = None
+) -> HierarchicalAgent:
     """The agent a bundle describes, for one robot: planner with verification, termination rule, skill.
 
     Args:
         bundle: verified policies.
         robot_radius: disc with which plans are swept against the map [m].
         goal_radius: distance at which the goal counts as reached [m].
+        planner: in the place of the bundle's own, such as one in a process of its own.
 
     Raises:
         BundleError: as `load_policies`.
     """
     policies, plan, replan = load_policies(bundle), bundle.manifest.plan, bundle.manifest.replan
-    proposer = GoseloPlanner(policies.planner, bundle.manifest.goselo.channels, plan.planning_radius_m)
-    expert = ShortestPathPlanner(
-        plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
-    )
     option = WaypointOption(
-        VerifiedPlanner(proposer, expert, robot_radius),
+        planner or make_planner(bundle, policies.planner, robot_radius),
         num_rows=1,
         rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
         num_waypoints=plan.waypoints,

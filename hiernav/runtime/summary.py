@@ -10,9 +10,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from hiernav.runtime.driver import RunResult
 from hiernav.runtime.loop import FixedRateLoop
 from hiernav.runtime.timing import TickTimer
+from hiernav.runtime.trip import RunResult
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,10 @@ def _episode(episode: Episode) -> dict[str, Any]:
         "true_distance": episode.true_distance,
         "stopped": result.stopped,
         "fault": result.fault,
+        "detail": result.detail,
+        "holds": dict(result.holds),
+        "recoveries": result.recoveries,
+        "planner": dict(result.planner),
         "replans": dict(result.replans),
         "guard": dict(result.guard),
         "estimator": dict(result.estimator),

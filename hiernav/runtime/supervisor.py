@@ -8,30 +8,40 @@ from enum import Enum
 
 
 class Mode(Enum):
-    """What the runtime is doing."""
+    """What the runtime is doing. The robot is braked in all of them but RUNNING and RECOVERING."""
 
     INIT = "init"
-    """Braked; sensors and estimator are not ready."""
+    """Sensors and estimator are not ready."""
     READY = "ready"
-    """Braked; it knows where it is."""
+    """It knows where it is, and has no goal."""
     ARMED = "armed"
-    """Braked; it has a goal and may go."""
+    """It has a goal, and waits for its first plan."""
     RUNNING = "running"
     """The policies drive."""
-    STOPPED = "stopped"
-    """Braked after a run that ended as it should."""
+    HOLD = "hold"
+    """It waits for something to pass, and goes on by itself."""
+    RECOVERING = "recovering"
+    """It gets away from where it did not come on, within bounds of time and distance."""
     FAULT = "fault"
-    """Braked after something that must be looked at. Latches until it is acknowledged."""
+    """Something must be looked at. Latches until it is acknowledged."""
+    ESTOP = "estop"
+    """Somebody pressed stop. Latches until it is released."""
 
+
+LATCHED = frozenset({Mode.FAULT, Mode.ESTOP})
+DRIVING = frozenset({Mode.RUNNING, Mode.RECOVERING})
 
 TRANSITIONS: dict[Mode, frozenset[Mode]] = {
-    Mode.INIT: frozenset({Mode.READY, Mode.STOPPED, Mode.FAULT}),
-    Mode.READY: frozenset({Mode.ARMED, Mode.STOPPED, Mode.FAULT}),
-    Mode.ARMED: frozenset({Mode.RUNNING, Mode.READY, Mode.STOPPED, Mode.FAULT}),
-    Mode.RUNNING: frozenset({Mode.STOPPED, Mode.FAULT}),
-    Mode.STOPPED: frozenset({Mode.INIT, Mode.FAULT}),
-    Mode.FAULT: frozenset(),
+    Mode.INIT: frozenset({Mode.READY, Mode.FAULT, Mode.ESTOP}),
+    Mode.READY: frozenset({Mode.INIT, Mode.ARMED, Mode.FAULT, Mode.ESTOP}),
+    Mode.ARMED: frozenset({Mode.INIT, Mode.READY, Mode.RUNNING, Mode.FAULT, Mode.ESTOP}),
+    Mode.RUNNING: frozenset({Mode.READY, Mode.HOLD, Mode.RECOVERING, Mode.FAULT, Mode.ESTOP}),
+    Mode.HOLD: frozenset({Mode.READY, Mode.RUNNING, Mode.FAULT, Mode.ESTOP}),
+    Mode.RECOVERING: frozenset({Mode.READY, Mode.RUNNING, Mode.HOLD, Mode.FAULT, Mode.ESTOP}),
+    Mode.FAULT: frozenset({Mode.ESTOP}),
+    Mode.ESTOP: frozenset(),
 }
+"""Out of FAULT and ESTOP leads only `Supervisor.acknowledge`, to INIT."""
 
 
 class InvalidTransition(RuntimeError):
@@ -45,10 +55,22 @@ class Supervisor:
         """`changed(now, mode, why)` is called after every change."""
         self._changed = changed
         self.mode = Mode.INIT
+        self.why = "started"
+        """Why it is in this mode."""
         self.fault: str | None = None
-        """Why it is in FAULT."""
+        """Why it is in FAULT or ESTOP."""
         self.history: deque[tuple[float, Mode, str]] = deque(maxlen=256)
         """Last changes: time [s], mode entered, why."""
+
+    @property
+    def driving(self) -> bool:
+        """Whether the robot may be sent anything but the brake."""
+        return self.mode in DRIVING
+
+    @property
+    def latched(self) -> bool:
+        """Whether somebody must acknowledge before anything goes on."""
+        return self.mode in LATCHED
 
     def change(self, mode: Mode, why: str, now: float) -> None:
         """Enter `mode`.
@@ -59,27 +81,33 @@ class Supervisor:
         if mode not in TRANSITIONS[self.mode]:
             allowed = ", ".join(sorted(each.name for each in TRANSITIONS[self.mode])) or "none"
             raise InvalidTransition(f"{self.mode.name} -> {mode.name} ({why}); allowed: {allowed}")
+        if mode in LATCHED:
+            self.fault = why
         self._enter(mode, why, now)
 
     def fail(self, why: str, now: float) -> None:
-        """Enter FAULT from anywhere; the first reason is kept."""
-        if self.mode is not Mode.FAULT:
-            self.fault = why
-            self._enter(Mode.FAULT, why, now)
+        """Enter FAULT from wherever that is possible; where one has latched already, its reason is kept."""
+        if not self.latched:
+            self.change(Mode.FAULT, why, now)
+
+    def stop(self, why: str, now: float) -> None:
+        """Enter ESTOP from anywhere."""
+        if self.mode is not Mode.ESTOP:
+            self.change(Mode.ESTOP, why, now)
 
     def acknowledge(self, now: float) -> None:
-        """Leave FAULT for INIT, on somebody's word that the cause is gone.
+        """Leave FAULT or ESTOP for INIT, on somebody's word that the cause is gone.
 
         Raises:
-            InvalidTransition: there is no fault.
+            InvalidTransition: nothing has latched.
         """
-        if self.mode is not Mode.FAULT:
+        if not self.latched:
             raise InvalidTransition(f"{self.mode.name}: there is no fault to acknowledge")
         self.fault = None
         self._enter(Mode.INIT, "acknowledged", now)
 
     def _enter(self, mode: Mode, why: str, now: float) -> None:
-        self.mode = mode
+        self.mode, self.why = mode, why
         self.history.append((now, mode, why))
         if self._changed is not None:
             self._changed(now, mode, why)

@@ -14,9 +14,9 @@ def supervisor_in(*path: Mode) -> Supervisor:
     return supervisor
 
 
-def test_a_run_goes_from_init_to_stopped_and_round_again():
-    supervisor = supervisor_in(Mode.READY, Mode.ARMED, Mode.RUNNING, Mode.STOPPED, Mode.INIT)
-    assert supervisor.mode is Mode.INIT
+def test_a_run_goes_from_init_over_running_and_waiting_back_to_ready():
+    path = (Mode.READY, Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RUNNING, Mode.RECOVERING, Mode.RUNNING, Mode.READY)
+    assert supervisor_in(*path, Mode.INIT).mode is Mode.INIT
 
 
 @given(st.lists(st.sampled_from(Mode), max_size=30))
@@ -34,10 +34,12 @@ def test_only_transitions_of_the_table_ever_happen(wishes):
 
 
 def test_nothing_runs_that_was_not_armed():
-    assert {mode for mode in Mode if Mode.RUNNING in TRANSITIONS[mode]} == {Mode.ARMED}
+    assert {mode for mode in Mode if Mode.RUNNING in TRANSITIONS[mode]} == {Mode.ARMED, Mode.HOLD, Mode.RECOVERING}
+    for mode in (Mode.HOLD, Mode.RECOVERING):
+        assert {each for each in Mode if mode in TRANSITIONS[each]} <= {Mode.RUNNING, Mode.RECOVERING}
 
 
-@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.ESTOP])
 def test_a_fault_is_possible_anywhere_and_latches_with_its_first_reason(mode):
     supervisor = Supervisor()
     supervisor.mode = mode
@@ -45,11 +47,35 @@ def test_a_fault_is_possible_anywhere_and_latches_with_its_first_reason(mode):
     supervisor.fail("first", 1.0)
     supervisor.fail("second", 2.0)
     assert (supervisor.mode, supervisor.fault) == (Mode.FAULT, "first")
+    for wish in set(Mode) - {Mode.ESTOP}:
+        with pytest.raises(InvalidTransition):
+            supervisor.change(wish, "test", 3.0)
+    supervisor.acknowledge(4.0)
+    assert (supervisor.mode, supervisor.fault) == (Mode.INIT, None)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_an_emergency_stop_is_possible_anywhere_and_latches(mode):
+    supervisor = Supervisor()
+    supervisor.mode = mode
+    supervisor.fault = "pressed" if mode is Mode.ESTOP else None
+    supervisor.stop("pressed", 1.0)
+    supervisor.stop("pressed again", 2.0)
+    supervisor.fail("something else", 3.0)
+    assert (supervisor.mode, supervisor.fault) == (Mode.ESTOP, "pressed")
     for wish in Mode:
         with pytest.raises(InvalidTransition):
             supervisor.change(wish, "test", 3.0)
     supervisor.acknowledge(4.0)
     assert (supervisor.mode, supervisor.fault) == (Mode.INIT, None)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_only_running_and_recovering_drive(mode):
+    supervisor = Supervisor()
+    supervisor.mode = mode
+    assert supervisor.driving == (mode in (Mode.RUNNING, Mode.RECOVERING))
+    assert supervisor.latched == (mode in (Mode.FAULT, Mode.ESTOP))
 
 
 def test_there_is_nothing_to_acknowledge_without_a_fault():

@@ -1,0 +1,173 @@
+"""What the loop watches besides the action itself. Each watchdog is a rule about time with one question to ask it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from hiernav.runtime.estimate import Estimate, Trust
+
+
+class BlindWatch:
+    """Notices that sensors no longer renew the estimate, whatever their stamps say."""
+
+    def __init__(self, hold_after: float, lost_after: float, first_after: float) -> None:
+        """
+        Args:
+            hold_after: age of an estimate that is not driven on [s].
+            lost_after: age that is a fault [s].
+            first_after: time the first estimate may take [s].
+        """
+        self.hold_after, self.lost_after, self.first_after = hold_after, lost_after, first_after
+        self._since: float | None = None
+        self._stamp = -math.inf
+
+    def check(self, estimate: Estimate | None, now: float) -> tuple[Trust, str]:
+        """What the newest estimate is good for at `now` [s], on the loop's clock, and what it suffers from."""
+        if self._since is None:
+            self._since = now
+        if estimate is None:
+            waited = now - self._since
+            if math.isinf(self._stamp):
+                why = f"no position and heading for {waited:.2f} s"
+                return (Trust.LOST if waited > self.first_after else Trust.HOLD), why
+        elif estimate.stamp > self._stamp:
+            self._since, self._stamp = now, estimate.stamp
+            return estimate.trust, estimate.why
+        age = now - self._since
+        if age > self.lost_after:
+            return Trust.LOST, f"no new sensor frame for {age:.2f} s"
+        if age > self.hold_after:
+            return Trust.HOLD, f"no new sensor frame for {age:.2f} s"
+        return (Trust.HOLD, "position and heading are unknown") if estimate is None else (estimate.trust, estimate.why)
+
+
+class OverrunWatch:
+    """Notices a machine that does not keep up, and when it does again."""
+
+    def __init__(self, limit: int = 3, good_ticks: int = 10) -> None:
+        """
+        Args:
+            limit: ticks in a row that missed their deadline after which the robot waits.
+            good_ticks: ticks in a row in time after which it goes on.
+        """
+        self.limit, self.good_ticks = limit, good_ticks
+        self._good = good_ticks
+        self._late = False
+
+    def check(self, overruns_in_a_row: int) -> str | None:
+        """Why to wait, or None; once per tick."""
+        if overruns_in_a_row >= self.limit:
+            self._late, self._good = True, 0
+        elif self._late:
+            self._good = 0 if overruns_in_a_row else self._good + 1
+            self._late = self._good < self.good_ticks
+        return f"{self.limit} overruns in a row" if self._late else None
+
+
+class PlanWatch:
+    """Notices a planner that does not answer: first the robot slows down, then it waits."""
+
+    def __init__(self, slow_after: float = 0.3, hold_after: float = 1.0) -> None:
+        """
+        Args:
+            slow_after: time for which a plan that has ended is followed at full speed [s].
+            hold_after: time after which it is not followed any more [s].
+        """
+        self.slow_after, self.hold_after = slow_after, hold_after
+
+    def check(self, overdue: float) -> tuple[float, str | None]:
+        """Speed [0, 1] at which a plan may be followed that ended `overdue` [s] ago, and why to wait, if so."""
+        if overdue <= self.slow_after:
+            return 1.0, None
+        if overdue <= self.hold_after:
+            return 0.5, None
+        return 0.0, f"no new plan {overdue:.2f} s after the last one ended"
+
+
+class BlockedWatch:
+    """Notices that no way leads on: planners have found none for some time."""
+
+    def __init__(self, hold_after: float, give_up_after: float) -> None:
+        """
+        Args:
+            hold_after: time without a way after which the robot waits [s].
+            give_up_after: time after which the goal counts as unreachable [s].
+        """
+        self.hold_after, self.give_up_after = hold_after, give_up_after
+        self._since: float | None = None
+
+    def check(self, refused: bool | None, now: float) -> tuple[str | None, bool]:
+        """Why to wait, and whether to give up; `refused` as in `Decision`."""
+        if refused is False:
+            self._since = None
+        elif refused and self._since is None:
+            self._since = now
+        if self._since is None:
+            return None, False
+        waited = now - self._since
+        return ("no way to the goal" if waited > self.hold_after else None), waited > self.give_up_after
+
+
+class SaturationWatch:
+    """Notices a skill that asks for all that the actuators can give, and goes on doing so."""
+
+    def __init__(self, action_dim: int, period: float, window: float = 2.0, share: float = 0.9) -> None:
+        """
+        Args:
+            action_dim: number of actuators.
+            period: of the control loop [s].
+            window: time that is looked at [s].
+            share: of the commands in it that lie at an actuator's limit.
+        """
+        self._counts: deque[int] = deque(maxlen=max(1, round(window / period)))
+        self._limit = share * (self._counts.maxlen or 1) * action_dim
+        self._sum = 0
+
+    def reset(self) -> None:
+        """Start with an empty window."""
+        self._counts.clear()
+        self._sum = 0
+
+    def check(self, action: np.ndarray) -> bool:
+        """Take in what the skill asks for (A,); whether the robot must be helped."""
+        count = sum(not -0.98 < value < 0.98 for value in action.tolist())
+        full = len(self._counts) == self._counts.maxlen
+        self._sum += count - (self._counts[0] if full else 0)
+        self._counts.append(count)
+        return len(self._counts) == self._counts.maxlen and self._sum >= self._limit
+
+
+class StopWatch:
+    """Decides from measured speeds whether a braked robot stands."""
+
+    def __init__(self, speed: float, timeout: float, readings: int = 3) -> None:
+        """
+        Args:
+            speed: a robot slower than this stands [m/s].
+            timeout: time it is given to stop [s].
+            readings: slow ones in a row that are needed.
+        """
+        self.speed, self.timeout, self.readings = speed, timeout, readings
+        self._since: float | None = None
+        self._slow = 0
+
+    def begin(self, now: float) -> None:
+        """The brake was first sent at `now` [s]."""
+        self._since, self._slow = now, 0
+
+    def check(self, estimate: Estimate | None, now: float) -> bool | None:
+        """Whether the robot stands; None while that is open, and after it was told once."""
+        if self._since is None:
+            return None
+        moving = estimate is None or not math.hypot(*estimate.velocity.tolist()) < self.speed
+        self._slow = 0 if moving else self._slow + 1
+        if self._slow >= self.readings:
+            self._since = None
+            return True
+        if now - self._since > self.timeout:
+            self._since = None
+            return False
+        return None

@@ -1,0 +1,145 @@
+"""A robot, a pilot and a driver for tests of what the loop does: no physics, no networks, no clock but the test's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hiernav.nav.occupancy import OccupancyMap, empty_map
+from hiernav.nav.option import TerminationReason
+from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.pilot import Decision
+from hiernav.runtime.robot import SensorFrame
+
+GOAL = np.array([0.98, 0.0])
+PERIOD = 0.1
+
+
+@dataclass
+class Puck:
+    """A robot that slides where it is pushed: the action is its velocity in x and y."""
+
+    control_period: float = PERIOD
+    action_dim: int = 2
+    position: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    stamp: float = 0.0
+    log: list[str] = field(default_factory=list)
+    sees: Callable[[SensorFrame], SensorFrame] = lambda frame: frame
+    stops: bool = True
+
+    def read(self) -> SensorFrame:
+        self.log.append("read")
+        return self.sees(
+            SensorFrame(
+                stamp=self.stamp,
+                accelerometer=np.array([0.0, 0.0, 9.81]),
+                gyro=np.zeros(3),
+                magnetometer=np.array([0.0, -0.5, 0.0]),
+                velocimeter=np.array([*self.velocity, 0.0]),
+                lidar=np.zeros(10),
+                position_fix=self.position.copy(),
+            )
+        )
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        self.log.append("send")
+        self._move(action)
+        return action
+
+    def brake(self) -> None:
+        self.log.append("brake")
+        self._move(np.zeros(2) if self.stops else self.velocity)
+
+    def close(self) -> None:
+        self.log.append("close")
+
+    def _move(self, velocity: np.ndarray) -> None:
+        self.velocity = np.array(velocity)
+        self.position = self.position + self.velocity * PERIOD
+        self.stamp += PERIOD
+
+
+@dataclass
+class Scripted:
+    """A pilot that goes straight at half speed, or does what `script` says at each step."""
+
+    script: Callable[[int, np.ndarray], np.ndarray] = lambda step, straight: straight
+    steps: int = 0
+    resets: int = 0
+    seen: list[Mapping[str, np.ndarray]] = field(default_factory=list)
+    changes: Callable[[int], dict[str, object]] = lambda step: {}
+    calls: list[str] = field(default_factory=list)
+    failed: str | None = None
+    rejected: int = 0
+    late: int = 0
+    restarts: int = 0
+    recoveries: int = 0
+
+    def reset(self) -> None:
+        self.steps = 0
+        self.resets += 1
+
+    def rest(self) -> None: ...
+
+    def drop(self) -> None:
+        self.calls.append("drop")
+
+    def replan(self) -> None:
+        self.calls.append("replan")
+
+    def recover(self) -> None:
+        self.calls.append("recover")
+
+    def renew(self) -> None:
+        self.calls.append("renew")
+        self.failed = None
+
+    def act(
+        self, now: float, estimate: Estimate, terms: Mapping[str, np.ndarray], goal: np.ndarray, occupancy: OccupancyMap
+    ) -> Decision:
+        assert estimate.pose.shape == (3,) and goal.shape == (2,) and isinstance(occupancy, OccupancyMap)
+        self.seen.append(terms)
+        towards = goal - estimate.pose[:2]
+        action = self.script(self.steps, 0.5 * towards / np.linalg.norm(towards)).astype(np.float32)
+        reason = TerminationReason.START if self.steps == 0 else TerminationReason.NONE
+        if self.steps and self.steps % 5 == 0:
+            reason = TerminationReason.HALF_INDEX
+        replanned = reason is not TerminationReason.NONE
+        if replanned:
+            self.plan_stamp = estimate.stamp
+        decision = Decision(
+            action=action, proposed=action, observation=np.zeros(3, np.float32), reason=reason, plan=np.zeros((10, 2)),
+            start=np.zeros(2), plan_stamp=self.plan_stamp, has_plan=True, replanned=replanned, overdue=0.0,
+            refused=False, recovering=False, given_up=False, plan_seconds=0.001,
+        )  # fmt: skip
+        decision = replace(decision, **self.changes(self.steps))  # type: ignore[arg-type]
+        self.steps += 1
+        return decision
+
+
+def driver_of(robot: Puck | None = None, pilot: Scripted | None = None, **settings: object) -> Driver:
+    field_map = empty_map((2.0, 2.0))
+    settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False)))
+    return Driver(robot or Puck(), pilot or Scripted(), lambda stamp: field_map, FakeClock(), **settings)
+
+
+class Listener(Observer):
+    def __init__(self) -> None:
+        self.records: list[TickRecord] = []
+        self.events: list[Event] = []
+        self.flushed: list[int] = []
+
+    def tick(self, record: TickRecord) -> None:
+        self.records.append(record)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def flush(self, timeout: float) -> None:
+        self.flushed.append(len(self.records))
