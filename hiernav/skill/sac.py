@@ -121,28 +121,23 @@ class Learner:
             action_spec=Bounded(-1.0, 1.0, (action_dim,)),
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
-        self._weights = [p for p in self.loss.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.Adam(self._weights, lr=settings.learning_rate, fused=True)
-        self._online = list(self.loss.qvalue_network_params.flatten_keys().values(True, True))
-        self._target = list(self.loss.target_qvalue_network_params.flatten_keys().values(True, True))
+        self.optimizer = torch.optim.Adam([self.loss.weights], settings.learning_rate, fused=True)
         self.updates = 0
 
     def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
         """One gradient step on a batch (B,) of transitions; returns detached scalars on the learner's device."""
-        out = self.loss(batch.to(self.device))
-        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
-        self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        if self.device.type != "cpu":
+            batch = batch.to(self.device)
+        metrics = self.loss.differentiate(batch)
         self.optimizer.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(self._target, self._online, self.settings.tau)
+        self.loss.move_targets(self.settings.tau)
         self.updates += 1
-        return {key: value.detach() for key, value in out.items()}
+        return metrics
 
     @property
     def finite(self) -> bool:
         """Whether all weights and the temperature are."""
-        return all(bool(weight.isfinite().all()) for weight in self._weights)
+        return bool(self.loss.weights.isfinite().all())
 
     def publish(self) -> None:
         """Let the acting policy have the weights learnt so far; where it is the one that learns, it has them."""

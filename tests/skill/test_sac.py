@@ -193,14 +193,44 @@ def test_the_losses_and_their_gradients_are_those_of_torchrl(layer_norm: bool, w
     transitions["next", "terminated"][::3] = True
     results = []
     for forward in (SACLoss.forward, type(source.loss).forward):
-        source.optimizer.zero_grad(set_to_none=True)
+        source.loss.zero_grad(set_to_none=True)
         out = forward(source.loss, transitions)
         (out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]).backward()
-        gradients = [weight.grad.clone() for weight in source._weights]
+        gradients = [weight.grad.clone() for weight in source.loss.parameters()]
         results.append(([out[name].detach() for name in ("loss_actor", "loss_qvalue", "loss_alpha")], gradients))
     for theirs, ours in zip(*results, strict=True):
         for one, other in zip(theirs, ours, strict=True):
             torch.testing.assert_close(one.reshape(other.shape), other, rtol=1e-4, atol=1e-6)
+
+
+@norms
+def test_products_in_bfloat16_change_losses_and_gradients_by_no_more_than_their_rounding(
+    layer_norm: bool, without_noise: None
+) -> None:
+    gradients, losses = [], []
+    for precision in ("float32", "bfloat16"):
+        source = learner(SacSettings(hidden=(64, 64), layer_norm=layer_norm, init_alpha=0.3, precision=precision))
+        out = source.loss.differentiate(batch(2, size=256))
+        losses.append(torch.stack([out[name].detach() for name in ("loss_actor", "loss_qvalue", "loss_alpha")]))
+        gradients.append(source.loss.weights.grad.clone())
+    torch.testing.assert_close(*losses, rtol=0.01, atol=0.01)
+    assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()
+    assert not torch.equal(*gradients)
+
+
+def test_an_update_takes_batches_of_any_size() -> None:
+    mixed, fresh = learner(), learner()
+    for size in (12, 5, 12):
+        torch.manual_seed(1)
+        mixed.loss.differentiate(batch(3, size=size))
+    torch.manual_seed(1)
+    fresh.loss.differentiate(batch(3, size=12))
+    assert torch.equal(mixed.loss.weights.grad, fresh.loss.weights.grad)
+
+
+def test_a_loss_whose_parameters_share_memory_refuses_to_be_moved() -> None:
+    with pytest.raises(RuntimeError, match="device"):
+        learner().loss.to(torch.float64)
 
 
 # checkpoints
