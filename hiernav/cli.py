@@ -359,6 +359,7 @@ def _config(arguments: argparse.Namespace) -> int:
 def _check_worlds(config: TrainConfig) -> None:
     """Refuse worlds that cannot be built or solved before anything is written."""
     from hiernav.config import ConfigError
+    from hiernav.planner.mix import WorldRange
     from hiernav.sim.layout import parse_world
     from hiernav.sim.robots import get_robot
     from hiernav.sim.worlds import sample_layout
@@ -371,7 +372,9 @@ def _check_worlds(config: TrainConfig) -> None:
     ):
         for text in texts:
             try:
-                sample_layout(parse_world(text), 0, radius)
+                specs = WorldRange(text).extremes() if key == "planner.worlds" else (parse_world(text),)
+                for spec in specs:
+                    sample_layout(spec, 0, radius)
             except ValueError as error:
                 raise ConfigError(f"{key} = {text!r}: {error}") from None
 

@@ -23,6 +23,10 @@ __all__ = [
 _WORLD_PATTERN = r"^(pillar\([^()]+\)|(gremlin|two-room|four-room)(\([^()]+\))?|map\(.+\)|.+\.ya?ml)$"
 _WORLD_HELP = "a world: pillar(2,2,10), gremlin, two-room, four-room, map(file.yaml)"
 World = Annotated[str, Meta(pattern=_WORLD_PATTERN, extra={"accepts": _WORLD_HELP})]
+_MIX_PATTERN = r"^(\d+(\.\d+)?\s*\*\s*)?" + _WORLD_PATTERN.removeprefix("^")
+_MIX_HELP = _WORLD_HELP + "; with ranges and a weight: 2*pillar(2..8,2..8,0.4..0.7/m2)"
+MixEntry = Annotated[str, Meta(pattern=_MIX_PATTERN, extra={"accepts": _MIX_HELP})]
+Precision = Literal["auto", "float32", "bfloat16"]
 Device = Literal["auto", "cpu", "cuda"]
 Width = Annotated[int, Meta(ge=1, le=8192)]
 
@@ -38,10 +42,16 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     device: Annotated[Device, Meta(description="Where the network learns; auto: on a GPU where there is one.")] = "auto"
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimiser.")] = 1e-3
     weight_decay: Annotated[float, Meta(ge=0, le=1, description="Decoupled weight decay of the optimiser.")] = 1e-4
-    hypotheses: Annotated[int, Meta(ge=1, le=16, description="Plans proposed at once; the best one learns.")] = 4
+    precision: Annotated[
+        Precision, Meta(description="Of products; auto: bfloat16 where the processor multiplies it natively.")
+    ] = "auto"
+    hypotheses: Annotated[int, Meta(ge=1, le=16, description="Plans proposed at once; the best one learns.")] = 6
     clearance_weight: Annotated[float, Meta(ge=0, description="Weight of the penalty on waypoints near obstacles.")] = (
         1.0
     )
+    heading_weight: Annotated[
+        float, Meta(ge=0, description="Weight of differences in heading from the labels; makes plans straight.")
+    ] = 0.3
     mirror: Annotated[bool, Meta(description="Double the data by reflection left to right.")] = True
     planning_radius_m: Annotated[
         Annotated[float, Meta(gt=0, le=10)] | None,
@@ -51,7 +61,8 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         float, Meta(ge=0, le=10, description="Further clearance worth a detour in labels [m].")
     ] = 0.15
     worlds: Annotated[
-        tuple[World, ...], Meta(min_length=1, description="Worlds the samples are drawn from, in equal parts.")
+        tuple[MixEntry, ...],
+        Meta(min_length=1, description="Worlds the samples are drawn from, each as often as its weight says."),
     ] = ("pillar(2,2,10)",)
 
 
@@ -127,7 +138,7 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ] = 0.0
     clock: Annotated[bool, Meta(description="Show the skill a gait clock of 3 Hz.")] = False
     precision: Annotated[
-        Literal["auto", "float32", "bfloat16"],
+        Precision,
         Meta(description="Of products in hidden layers; auto: bfloat16 where the processor multiplies it natively."),
     ] = "auto"
     layer_norm: Annotated[bool, Meta(description="Layer normalisation in the critics.")] = False
@@ -193,7 +204,14 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "planner": {
-        "paper": {"weight_decay": 0.0, "hypotheses": 1, "clearance_weight": 0.0, "mirror": False, "soft_margin_m": 0.0},
+        "paper": {
+            "weight_decay": 0.0,
+            "hypotheses": 1,
+            "clearance_weight": 0.0,
+            "heading_weight": 0.0,
+            "mirror": False,
+            "soft_margin_m": 0.0,
+        },
     },
     "skill": {
         "paper": {

@@ -73,7 +73,7 @@ def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:
         raise ValueError(f"unknown planner {kind!r}; known: cnn, astar")
     if policies.network is None:
         raise ValueError("these policies hold no planner network: train the planner first, or use --planner astar")
-    proposer = GoseloPlanner(policies.network, policies.channels, expert.radius)
+    proposer = GoseloPlanner(policies.network, policies.channels, expert.radius, expert.soft_margin)
     return VerifiedPlanner(proposer, expert, get_robot(policies.config.robot).radius) if repair else proposer
 
 

@@ -35,7 +35,7 @@ from hiernav.nav.bundle import (
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.planner.network import HypothesisNetwork, PaperNetwork
-from hiernav.planner.train import load_network, torch_planner
+from hiernav.planner.train import label_settings, load_network, torch_planner
 from hiernav.run import Run, RunError
 from hiernav.runtime.policy import check_golden
 from hiernav.sim.factory import make_task, skill_layout
@@ -147,7 +147,7 @@ def record_inputs(
     config: TrainConfig, network: PaperNetwork | HypothesisNetwork, actor: Actor, count: int
 ) -> dict[str, np.ndarray]:
     """Inputs of both networks recorded while they drive: observation (count, D), image, distance."""
-    planner = torch_planner(network, config.planner.planning_radius_m or get_robot(config.robot).radius)
+    planner = torch_planner(network, label_settings(config))
     images: list[np.ndarray] = []
     distances: list[np.ndarray] = []
     inner = planner.network

@@ -41,7 +41,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         if run.config.skill.planner == "cnn":
             if not planner.finished:
                 raise ValueError("skill.planner = cnn needs a trained planner: run the planner stage first")
-            guide = planner_train.torch_planner(planner.network.cpu(), planner.labels.radius)
+            guide = planner_train.torch_planner(planner.network.cpu(), planner.labels)
         _train_skill(run, guide, progress)
 
 

@@ -18,6 +18,9 @@ Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
 scores (M, H) of H hypotheses."""
 
+_TIGHTNESS = 4.0
+"""Score that a hypothesis loses which leaves nothing beyond the radius."""
+
 
 @dataclass
 class ShortestPathPlanner:
@@ -82,7 +85,9 @@ class GoseloPlanner:
     network: Network
     channels: tuple[str, ...] = goselo.CHANNELS
     radius: float = 0.1
-    """Clearance a hypothesis should keep [m]."""
+    """Clearance a hypothesis must keep where any does [m]."""
+    margin: float = 0.15
+    """Further clearance worth a lower score: what a robot that strays from its plan needs [m]."""
     hysteresis: float = 0.5
     """Score a hypothesis gains by lying on the plan it replaces; keeps plans from flipping sides."""
 
@@ -110,7 +115,9 @@ class GoseloPlanner:
         apart = np.linalg.norm(candidates[:, :, -1] - query.previous[:, None, -1], axis=-1)
         agreement = np.exp(-np.nan_to_num(apart, nan=np.inf) / 0.3)
         shortfall = np.clip(self.radius - clearance, 0.0, None) / self.radius
-        best = (scores + self.hysteresis * agreement - 100.0 * shortfall).argmax(axis=1)
+        tight = np.clip(1.0 - (clearance - self.radius) / max(self.margin, 1e-6), 0.0, 1.0)
+        merit = scores + self.hysteresis * agreement - 100.0 * shortfall - _TIGHTNESS * tight**2
+        best = merit.argmax(axis=1)
         return candidates[np.arange(len(candidates)), best]
 
 

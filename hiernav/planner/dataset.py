@@ -6,19 +6,24 @@ obstacles too; the other half lie on the way from such a start to the goal, with
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import Any, TypeVar
 
 import numpy as np
 
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.search import PathField, random_shortcuts, resample
-from hiernav.sim.layout import WorldSpec, parse_world
+from hiernav.planner.mix import WorldMix
+from hiernav.sim.layout import WorldSpec
 from hiernav.sim.worlds import sample_layout
 
+T = TypeVar("T")
+
+_CLEARANCE = "clearance_local"
 _WORLDS_PER_TASK = 8
 _MIN_CLEARANCE = 0.03
 """Starts keep at least this far from obstacles [m]: a robot in contact is about there."""
@@ -31,14 +36,23 @@ class LabelSettings:
     """How labels are made."""
 
     worlds: tuple[str, ...]
+    """Entries of a `WorldMix`."""
     radius: float
+    """Disc that labels keep free [m]."""
     soft_margin: float
+    """Further clearance worth a detour [m]."""
     waypoints: int = 10
     spacing: float = 0.1
     samples_per_world: int = 100
     random_smoothing: bool = False
     """The paper's random shortcuts instead of the longest straight lines."""
     channels: tuple[str, ...] = goselo.METRIC_CHANNELS
+    """What the network is shown."""
+
+    @property
+    def image_channels(self) -> tuple[str, ...]:
+        """Channels of a sample's image: the network's, and the clearance for the loss if it is not the last of them."""
+        return self.channels if self.channels[-1] == _CLEARANCE else (*self.channels, _CLEARANCE)
 
 
 @dataclass
@@ -46,13 +60,37 @@ class Samples:
     """Network inputs and labels in the GOSELO frame."""
 
     image: np.ndarray
-    """(S, C, 64, 64) uint8."""
-    clearance: np.ndarray
-    """(S, 64, 64) uint8, `clearance_local` crop for the penalty on waypoints near obstacles."""
+    """(S, C, 64, 64) uint8, `LabelSettings.image_channels`."""
     distance: np.ndarray
     """(S,) float32, L [m]."""
     label: np.ndarray
     """(S, K, 2) float32, right and up of the robot [m]."""
+
+    @classmethod
+    def empty(cls, settings: LabelSettings, count: int) -> Samples:
+        """Room for `count` samples."""
+        return cls(
+            np.empty((count, len(settings.image_channels), goselo.PIXELS, goselo.PIXELS), dtype=np.uint8),
+            np.empty(count, dtype=np.float32),
+            np.empty((count, settings.waypoints, 2), dtype=np.float32),
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Samples]) -> Samples:
+        """Several sets as one."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    def store(self, first: int, part: Samples) -> int:
+        """Copy `part`, or as much of it as there is room for, to the rows from `first` on; how many that were."""
+        keep = min(len(part), len(self) - first)
+        for name in self.__dataclass_fields__:
+            getattr(self, name)[first : first + keep] = getattr(part, name)[:keep]
+        return keep
+
+    @property
+    def clearance(self) -> np.ndarray:
+        """(S, 64, 64) uint8, `clearance_local` crop for the penalty on waypoints near obstacles."""
+        return self.image[:, -1]
 
     def __len__(self) -> int:
         return len(self.label)
@@ -71,32 +109,22 @@ def make_samples(
         (settings, tuple(seed), first, min(_WORLDS_PER_TASK, worlds - first))
         for first in range(0, worlds, _WORLDS_PER_TASK)
     ]
-    channels, waypoints = len(settings.channels), settings.waypoints
-    samples = Samples(
-        np.empty((count, channels, goselo.PIXELS, goselo.PIXELS), dtype=np.uint8),
-        np.empty((count, goselo.PIXELS, goselo.PIXELS), dtype=np.uint8),
-        np.empty(count, dtype=np.float32),
-        np.empty((count, waypoints, 2), dtype=np.float32),
-    )
-    done = 0
-
-    def store(part: Samples) -> None:
-        nonlocal done
-        keep = min(len(part), count - done)
-        for name in ("image", "clearance", "distance", "label"):
-            getattr(samples, name)[done : done + keep] = getattr(part, name)[:keep]
-        done += keep
+    samples, done = Samples.empty(settings, count), 0
+    for part in map_tasks(label_worlds, tasks, processes):
+        done += samples.store(done, part)
         if on_progress is not None:
             on_progress(done)
-
-    if processes > 1:
-        with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
-            for part in pool.map(_label_worlds, *zip(*tasks, strict=True)):
-                store(part)
-    else:
-        for task in tasks:
-            store(_label_worlds(*task))
     return samples
+
+
+def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], processes: int) -> Iterator[T]:
+    """Results of `function(*task)` in the order of the tasks, computed here or in several processes."""
+    if processes == 1 or len(tasks) == 1:
+        for task in tasks:
+            yield function(*task)
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
+        yield from pool.map(function, *zip(*tasks, strict=True))
 
 
 def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:
@@ -129,13 +157,9 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
         labels.append(label)
         visits.append(seen)
     frame = goselo.GoseloFrame.of(np.array(starts), np.broadcast_to(layout.goal, (count, 2)))
-    image = goselo.images([occupancy] * count, visits, frame, settings.channels)
-    if "clearance_local" in settings.channels:
-        clearance = image[:, settings.channels.index("clearance_local")]
-    else:
-        clearance = goselo.images([occupancy] * count, visits, frame, ("clearance_local",))[:, 0]
+    image = goselo.images([occupancy] * count, visits, frame, settings.image_channels)
     label = frame.from_world(np.array(labels)).astype(np.float32)
-    return Samples(image, clearance, frame.distance.astype(np.float32), label)
+    return Samples(image, frame.distance.astype(np.float32), label)
 
 
 def _label(field: PathField, start: np.ndarray, settings: LabelSettings, rng: np.random.Generator) -> np.ndarray | None:
@@ -156,10 +180,12 @@ def _random_start(occupancy: OccupancyMap, rng: np.random.Generator) -> np.ndarr
             return points[free[0]]
 
 
-def _label_worlds(settings: LabelSettings, seed: tuple[int, ...], first: int, worlds: int) -> Samples:
-    parts = []
+def label_worlds(settings: LabelSettings, seed: tuple[int, ...], first: int, worlds: int) -> Samples:
+    """The samples of some consecutive worlds of a seed's endless sequence."""
+    mix, parts = WorldMix(settings.worlds), []
     for number in range(first, first + worlds):
-        which, world_seed = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(2)
-        spec = parse_world(settings.worlds[which % len(settings.worlds)])
-        parts.append(label_world(settings, spec, int(world_seed), settings.samples_per_world))
-    return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in Samples.__dataclass_fields__))
+        sequence = np.random.SeedSequence(seed, spawn_key=(number,))
+        world_seed = int(sequence.generate_state(1)[0])
+        spec = mix.draw(np.random.default_rng(sequence.spawn(1)[0]))
+        parts.append(label_world(settings, spec, world_seed, settings.samples_per_world))
+    return Samples.join(parts)

@@ -13,19 +13,32 @@ from torch import nn
 from torch.nn import functional
 
 from hiernav.config import TrainConfig
-from hiernav.device import choose_device, random_state, restore_random_state
+from hiernav.device import (
+    choose_device,
+    choose_precision,
+    keep_freed_memory,
+    random_state,
+    restore_random_state,
+)
 from hiernav.nav import goselo
 from hiernav.nav.planners import GoseloPlanner
 from hiernav.planner.dataset import LabelSettings, Samples, make_samples
-from hiernav.planner.network import HypothesisNetwork, PaperNetwork, TorchNetwork, make_network
+from hiernav.planner.mix import WorldMix
+from hiernav.planner.network import (
+    HypothesisNetwork,
+    Output,
+    PaperNetwork,
+    TorchNetwork,
+    make_network,
+    network_class,
+)
 from hiernav.run import Run, TrainingDiverged
-from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
-"""image, clearance, distance, label as in `Samples`."""
+"""Image as the network takes it, clearance, distance and label as in `Samples`."""
 _VALIDATION = 2000
 _VALIDATION_SEED = 0xE7A1
 _WALKS = 200
@@ -52,23 +65,14 @@ class PlannerTrainer:
     def __init__(self, config: TrainConfig, run: Run) -> None:
         self.config, self.run = config, run
         planner = config.planner
-        radius = planner.planning_radius_m or get_robot(config.robot).radius
         seed = np.random.SeedSequence((config.seed, 3)).generate_state(1)
         torch.manual_seed(int(seed[0]))
         self.device = choose_device(planner.device, "planner.device")
         self.network = make_network(
             planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
         ).to(self.device, memory_format=torch.channels_last)
-        self.labels = LabelSettings(
-            worlds=planner.worlds,
-            radius=radius,
-            soft_margin=planner.soft_margin_m,
-            waypoints=config.option.waypoints,
-            spacing=config.option.spacing_m,
-            samples_per_world=planner.samples_per_world,
-            random_smoothing=planner.preset == "paper",
-            channels=self.network.channels,
-        )
+        self.precision = choose_precision(planner.precision, self.device)
+        self.labels = label_settings(config)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=planner.learning_rate, weight_decay=planner.weight_decay
         )
@@ -121,6 +125,7 @@ class PlannerTrainer:
             lambda done: report("data set", done, planner.samples),
         )
         held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
+        keep_freed_memory()  # after the samples, which are freed for good
         began, first, total = time.perf_counter(), self.epoch * planner.samples, planner.epochs * planner.samples
         while not self.finished:
             started = time.perf_counter()
@@ -140,10 +145,10 @@ class PlannerTrainer:
         order = torch.randperm(len(samples)).numpy()
         for first in range(0, len(order), planner.batch_size):
             rows = np.sort(order[first : first + planner.batch_size])
-            batch = _tensors(samples, rows, self.device)
-            if planner.mirror:
-                batch = _mirror(batch, (torch.rand(len(rows)) < 0.5).to(self.device))
-            loss = plan_loss(self.network, batch, self._margin, planner.clearance_weight)
+            batch = self._batch(samples, rows, planner.mirror)
+            with torch.autocast(self.device.type, self.precision, enabled=self.precision != torch.float32):
+                output = self.network(batch[0], batch[2])
+            loss = plan_loss(output, batch, self._weights)
             value = float(loss.detach())
             if not math.isfinite(value):  # never to be sent back: grid_sample crashes on waypoints that are NaN
                 raise self._diverged(f"loss not finite in batch {first // planner.batch_size + 1}")
@@ -169,9 +174,22 @@ class PlannerTrainer:
         )
 
     @property
-    def _margin(self) -> float:
-        """Clearance that waypoints are pushed to [m]."""
-        return self.labels.radius + 0.3 * self.labels.soft_margin
+    def _weights(self) -> LossWeights:
+        planner = self.config.planner
+        margin = self.labels.radius + 0.3 * self.labels.soft_margin
+        return LossWeights(planner.clearance_weight, margin, planner.heading_weight, self.labels.spacing)
+
+    def _batch(self, samples: Samples, rows: np.ndarray, mirror: bool = False) -> Batch:
+        """Some samples on the device, half of them reflected left to right on request."""
+        image, distance, label = (
+            torch.from_numpy(values[rows]).to(self.device)
+            for values in (samples.image, samples.distance, samples.label)
+        )
+        if mirror:
+            image, label = reflect(image, label, (torch.rand(len(rows)) < 0.5).to(self.device))
+        # channels last: convolutions of few channels take half the time, those of the paper's network a quarter
+        shown = image[:, : len(self.network.channels)].contiguous(memory_format=torch.channels_last)
+        return shown, image[:, -1], distance, label
 
     @torch.no_grad()
     def _validate(self, samples: Samples) -> dict[str, float]:
@@ -179,7 +197,7 @@ class PlannerTrainer:
         errors, hits = [], []
         for first in range(0, len(samples), 500):
             rows = np.arange(first, min(first + 500, len(samples)))
-            image, clearance, distance, label = _tensors(samples, rows, self.device)
+            image, clearance, distance, label = self._batch(samples, rows)
             waypoints, scores = self.network(image, distance)
             chosen = waypoints[torch.arange(len(label), device=self.device), scores.argmax(dim=1)]
             errors.append((chosen - label).norm(dim=-1).mean(dim=-1))
@@ -187,10 +205,13 @@ class PlannerTrainer:
         return {"error": float(torch.cat(errors).mean()), "blocked_waypoints": float(torch.cat(hits).mean())}
 
     def _walk(self) -> dict[str, float]:
-        spec = parse_world(self.config.planner.worlds[0])
-        seeds = np.random.SeedSequence((self.config.seed, _VALIDATION_SEED, 1)).generate_state(_WALKS)
-        layouts = [sample_layout(spec, int(seed), self.labels.radius) for seed in seeds]
-        result = walk(torch_planner(self.network, self.labels.radius), layouts, self.labels.radius)
+        mix, seed = WorldMix(self.labels.worlds), (self.config.seed, _VALIDATION_SEED, 1)
+        rng = np.random.default_rng(seed)
+        layouts = [
+            sample_layout(mix.draw(rng), int(s), self.labels.radius)
+            for s in np.random.SeedSequence(seed).generate_state(_WALKS)
+        ]
+        result = walk(torch_planner(self.network, self.labels), layouts, self.labels.radius)
         return {
             "walk_collisions": float(result.collisions.mean()),
             "walk_reach_rate": float(result.reached.mean()),
@@ -210,28 +231,44 @@ class PlannerTrainer:
         )
 
 
-def plan_loss(
-    network: PaperNetwork | HypothesisNetwork,
-    batch: Batch,
-    margin: float,
-    clearance_weight: float,
-) -> torch.Tensor:
-    """Loss of a batch (B,): squared distance of the best hypothesis, its score, and a lack of clearance.
+@dataclass(frozen=True)
+class LossWeights:
+    """What else counts in the loss beside the distance from the label."""
 
-    With one hypothesis and `clearance_weight` 0 this is the paper's loss (Eq. 1), times ten.
+    clearance: float = 0.0
+    """Of a lack of clearance, relative to `margin` and squared."""
+    margin: float = 0.1
+    """Clearance that waypoints are pushed to [m]."""
+    heading: float = 0.0
+    """Of steps that are other than the label's, relative to `spacing` and squared: it straightens plans."""
+    spacing: float = 0.1
+    """Distance between waypoints [m]."""
+
+
+def plan_loss(output: Output, batch: Batch, weights: LossWeights) -> torch.Tensor:
+    """Loss of a network's output (B, H, K, 2), (B, H): squared distance of the best hypothesis, its score, and more.
+
+    With one hypothesis and weights of 0 this is the paper's loss (Eq. 1), times ten.
     """
-    image, clearance, distance, label = batch
-    waypoints, scores = network(image, distance)
+    (waypoints, scores), (_, clearance, _, label) = output, batch
     squared = (waypoints - label[:, None]).square().sum(-1).mean(-1)
     best = squared.detach().argmin(dim=1)
     fit = squared.gather(1, best[:, None])[:, 0].mean()
     loss = 10.0 * fit
     if waypoints.shape[1] > 1:
         loss = loss + 10.0 * _OTHER_HYPOTHESES * squared.mean() + 0.1 * functional.nll_loss(scores, best)
-    if clearance_weight > 0:
-        lack = (margin - clearance_at(clearance, waypoints)).clamp(min=0.0) / margin
-        loss = loss + clearance_weight * lack.square().mean()
+    if weights.heading > 0:
+        apart = _steps(waypoints[torch.arange(len(best), device=best.device), best]) - _steps(label)
+        loss = loss + weights.heading * (apart / weights.spacing).square().sum(-1).mean()
+    if weights.clearance > 0:
+        lack = (weights.margin - clearance_at(clearance, waypoints)).clamp(min=0.0) / weights.margin
+        loss = loss + weights.clearance * lack.square().mean()
     return loss
+
+
+def _steps(plan: torch.Tensor) -> torch.Tensor:
+    """From the robot to the first waypoint, and from each to the next: (B, K, 2) -> (B, K, 2)."""
+    return torch.diff(plan, dim=1, prepend=torch.zeros_like(plan[:, :1]))
 
 
 def clearance_at(clearance: torch.Tensor, waypoints: torch.Tensor) -> torch.Tensor:
@@ -241,9 +278,9 @@ def clearance_at(clearance: torch.Tensor, waypoints: torch.Tensor) -> torch.Tens
     return functional.grid_sample(field, grid, align_corners=False, padding_mode="border")[:, 0]
 
 
-def torch_planner(network: PaperNetwork | HypothesisNetwork, radius: float) -> GoseloPlanner:
-    """A trained network as a planner."""
-    return GoseloPlanner(TorchNetwork(network), network.channels, radius)
+def torch_planner(network: PaperNetwork | HypothesisNetwork, labels: LabelSettings) -> GoseloPlanner:
+    """A trained network as a planner that keeps the clearance of its labels where it can."""
+    return GoseloPlanner(TorchNetwork(network), network.channels, labels.radius, labels.soft_margin)
 
 
 def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisNetwork:
@@ -254,19 +291,22 @@ def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisN
     return network.eval()
 
 
-def _tensors(samples: Samples, rows: np.ndarray, device: torch.device) -> Batch:
-    image, clearance, distance, label = (
-        torch.from_numpy(values[rows]).to(device)
-        for values in (samples.image, samples.clearance, samples.distance, samples.label)
+def label_settings(config: TrainConfig) -> LabelSettings:
+    """How a configuration's samples are labelled."""
+    planner, option = config.planner, config.option
+    return LabelSettings(
+        worlds=planner.worlds,
+        radius=planner.planning_radius_m or get_robot(config.robot).radius,
+        soft_margin=planner.soft_margin_m,
+        waypoints=option.waypoints,
+        spacing=option.spacing_m,
+        samples_per_world=planner.samples_per_world,
+        random_smoothing=planner.preset == "paper",
+        channels=network_class(planner.preset).channels,
     )
-    # channels last: convolutions of few channels take half the time, those of the paper's network a quarter
-    return image.contiguous(memory_format=torch.channels_last), clearance, distance, label
 
 
-def _mirror(batch: Batch, which: torch.Tensor) -> Batch:
-    """Reflect some rows left to right."""
-    image, clearance, distance, label = batch
+def reflect(image: torch.Tensor, label: torch.Tensor, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Reflect some rows (B,) of images (B, C, 64, 64) and labels (B, K, 2) left to right."""
     image = torch.where(which[:, None, None, None], image.flip(-1), image)
-    clearance = torch.where(which[:, None, None], clearance.flip(-1), clearance)
-    label = torch.where(which[:, None, None], label * label.new_tensor([-1.0, 1.0]), label)
-    return image, clearance, distance, label
+    return image, torch.where(which[:, None, None], label * label.new_tensor([-1.0, 1.0]), label)

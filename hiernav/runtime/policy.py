@@ -128,7 +128,7 @@ def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: floa
 
     plan = bundle.manifest.plan
     return VerifiedPlanner(
-        GoseloPlanner(network, bundle.manifest.goselo.channels, plan.planning_radius_m),
+        GoseloPlanner(network, bundle.manifest.goselo.channels, plan.planning_radius_m, plan.soft_margin_m),
         ShortestPathPlanner(
             plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
         ),

@@ -16,6 +16,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
 
 from hiernav.config import SkillConfig
+from hiernav.device import choose_precision
 from hiernav.nav.observation import ObservationLayout
 from hiernav.skill.loss import DirectSACLoss
 from hiernav.skill.networks import Actor, Critic
@@ -70,17 +71,6 @@ class PartlyGreedy(TensorDictModuleBase):
 def exploring(policy: ProbabilisticActor, skill: SkillConfig) -> TensorDictModuleBase:
     """What acts in training, with the weights of `policy`; a new one for every segment."""
     return PartlyGreedy(policy, skill.greedy_share)
-
-
-def choose_precision(name: str, device: torch.device) -> torch.dtype:
-    """The type behind a name; "auto" is bfloat16 where a processor multiplies it natively, not on a GPU.
-
-    (A GPU is busy starting kernels at these sizes: the conversions would cost more than the products save.)
-    """
-    if name == "auto":
-        native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-        name = "bfloat16" if device.type == "cpu" and native else "float32"
-    return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
 
 
 class Learner:

@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 from hiernav.nav import goselo  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
-from hiernav.planner.train import PlannerTrainer, clearance_at, load_network, plan_loss  # noqa: E402
+from hiernav.planner.train import LossWeights, PlannerTrainer, clearance_at, load_network, plan_loss, reflect  # noqa: E402
 from hiernav.run import Run, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
@@ -130,28 +130,21 @@ def test_a_finished_planner_is_not_trained_again(tmp_path, monkeypatch):
     assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
 
 
-class Fixed(torch.nn.Module):
-    """Proposes the same plans whatever it sees."""
-
-    def __init__(self, waypoints, scores):
-        super().__init__()
-        self.waypoints, self.scores = waypoints, scores
-
-    def forward(self, image, distance):
-        return self.waypoints, self.scores
-
-
 def batch_of(label: torch.Tensor, clearance: int = 255) -> planner_train.Batch:
     rows = len(label)
     crop = torch.full((rows, 64, 64), clearance, dtype=torch.uint8)
     return torch.zeros((rows, 4, 64, 64), dtype=torch.uint8), crop, torch.ones(rows), label
 
 
-def test_with_one_hypothesis_and_no_penalty_the_loss_is_the_papers():
+def loss_of(plans: torch.Tensor, scores: torch.Tensor, batch: planner_train.Batch, **weights: float) -> float:
+    return float(plan_loss((plans, scores), batch, LossWeights(**weights)))
+
+
+def test_with_one_hypothesis_and_no_weights_the_loss_is_the_papers():
     generator = torch.Generator().manual_seed(0)
     label, plans = (torch.randn((5, 10, 2), generator=generator) for _ in range(2))
-    loss = plan_loss(Fixed(plans[:, None], torch.zeros(5, 1)), batch_of(label, clearance=0), 0.1, 0.0)
-    torch.testing.assert_close(loss, 10.0 * (plans - label).square().sum(-1).mean())
+    loss = loss_of(plans[:, None], torch.zeros(5, 1), batch_of(label, clearance=0))
+    assert loss == pytest.approx(10.0 * float((plans - label).square().sum(-1).mean()))
 
 
 def test_the_best_hypothesis_decides_and_its_score_is_what_learns():
@@ -160,25 +153,38 @@ def test_the_best_hypothesis_decides_and_its_score_is_what_learns():
     sideways = label.flip(-1)
     plans = torch.stack([sideways, label], dim=1)
     sure_of = {
-        which: float(plan_loss(Fixed(plans, torch.log_softmax(torch.tensor([score]), -1)), batch_of(label), 0.1, 0.0))
+        which: loss_of(plans, torch.log_softmax(torch.tensor([score]), -1), batch_of(label))
         for which, score in (("best", [0.0, 5.0]), ("other", [5.0, 0.0]))
     }
-    lone = float(plan_loss(Fixed(plans[:, :1], torch.zeros(1, 1)), batch_of(label), 0.1, 0.0))
-    assert sure_of["best"] < sure_of["other"] < lone
+    assert sure_of["best"] < sure_of["other"] < loss_of(plans[:, :1], torch.zeros(1, 1), batch_of(label))
 
 
 def test_waypoints_near_obstacles_cost_and_those_with_room_do_not():
     plans = torch.zeros((1, 1, 10, 2))
-    network = Fixed(plans, torch.zeros(1, 1))
 
     def penalty(clearance: int) -> float:
-        batch = batch_of(plans[:, 0], clearance)
-        return float(plan_loss(network, batch, 0.2, 1.0) - plan_loss(network, batch, 0.2, 0.0))
+        return loss_of(plans, torch.zeros(1, 1), batch_of(plans[:, 0], clearance), clearance=1.0, margin=0.2)
 
     assert penalty(255) == 0.0
     assert penalty(0) == pytest.approx(1.0)
     half = round(0.1 / goselo.CLEARANCE_CLIP * 255)
     assert penalty(half) == pytest.approx(0.25, abs=0.02)
+
+
+def test_a_zigzag_costs_more_than_a_straight_plan_as_far_from_the_label():
+    label = torch.zeros((1, 10, 2))
+    label[..., 1] = 0.1 * torch.arange(1, 11)
+    aside, zigzag = label.clone(), label.clone()
+    aside[..., 0] += 0.03
+    zigzag[..., 0] += 0.03 * (-1.0) ** torch.arange(10)
+    losses = [
+        [loss_of(plan[:, None], torch.zeros(1, 1), batch_of(label), heading=weight) for plan in (aside, zigzag)]
+        for weight in (0.0, 1.0)
+    ]
+    assert losses[0][0] == pytest.approx(losses[0][1])
+    # aside: one step of ten is off by 0.3 spacings; zigzag: the other nine by 0.6
+    assert losses[1][0] - losses[0][0] == pytest.approx(0.009)
+    assert losses[1][1] - losses[0][1] == pytest.approx(0.009 + 9 * 0.036)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -205,7 +211,7 @@ def test_a_reflected_sample_is_the_sample_of_the_reflected_world():
     position = np.array([[-1.2, -1.3], [0.9, 0.2]])
     label = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 10, 2))
 
-    def batch(world, where, plan) -> planner_train.Batch:
+    def batch(world, where, plan) -> tuple[torch.Tensor, torch.Tensor]:
         maps: list[OccupancyMap] = [world.occupancy(0.0)] * 2
         visits = [VisitMap(m) for m in maps]
         for each, start in zip(visits, where, strict=True):
@@ -213,30 +219,25 @@ def test_a_reflected_sample_is_the_sample_of_the_reflected_world():
         frame = goselo.GoseloFrame.of(where, np.broadcast_to(world.goal, (2, 2)))
         image = goselo.images(maps, visits, frame, (*goselo.METRIC_CHANNELS, "visits_2"))
         in_frame = frame.from_world(plan).astype(np.float32)
-        return tuple(map(torch.from_numpy, (image, image[:, 3].copy(), frame.distance.astype(np.float32), in_frame)))
+        return torch.from_numpy(image), torch.from_numpy(in_frame)
 
     ours = batch(layout, position, position[:, None] + label)
     theirs = batch(other, position * flip, position[:, None] * flip + label * flip)
-    turned = planner_train._mirror(ours, torch.tensor([True, True]))
-    for index, name in enumerate(("image", "clearance", "distance", "label")):
-        apart = (turned[index].float() - theirs[index].float()).abs()
-        limit = 8.0 if index < 2 else 1e-5
-        assert (apart > limit).float().mean() < 0.01, name
-        if name != "distance":
-            assert ((ours[index].float() - theirs[index].float()).abs() > limit).float().mean() > 0.05, name
+    turned = reflect(*ours, torch.tensor([True, True]))
+    for index, (name, limit) in enumerate((("image", 8.0), ("label", 1e-5))):
+        assert ((turned[index].float() - theirs[index].float()).abs() > limit).float().mean() < 0.01, name
+        assert ((ours[index].float() - theirs[index].float()).abs() > limit).float().mean() > 0.05, name
 
 
 def test_reflection_keeps_label_and_clearance_together_and_leaves_other_rows_alone():
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (4, 4, 64, 64), dtype=torch.uint8, generator=generator)
-    clearance = torch.randint(0, 256, (4, 64, 64), dtype=torch.uint8, generator=generator)
     label = torch.rand((4, 10, 2), generator=generator) * 2.0 - 1.0
     which = torch.tensor([True, False, True, False])
-    batch = (image, clearance, torch.ones(4), label)
-    turned = planner_train._mirror(batch, which)
-    before, after = (clearance_at(b[1], b[3][:, None]) for b in (batch, turned))
+    turned = reflect(image, label, which)
+    before, after = (clearance_at(i[:, -1], plan[:, None]) for i, plan in ((image, label), turned))
     torch.testing.assert_close(before, after, rtol=0, atol=1e-4)
-    for mine, theirs in zip(batch, turned, strict=True):
-        assert torch.equal(mine[~which], theirs[~which])
-    again = planner_train._mirror(turned, which)
-    assert all(torch.equal(mine, theirs) for mine, theirs in zip(batch, again, strict=True))
+    for mine, theirs in zip((image, label), turned, strict=True):
+        assert torch.equal(mine[~which], theirs[~which]) and not torch.equal(mine[which], theirs[which])
+    again = reflect(*turned, which)
+    assert all(torch.equal(mine, theirs) for mine, theirs in zip((image, label), again, strict=True))
