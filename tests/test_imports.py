@@ -42,6 +42,7 @@ ALLOWED = {
         "config",
         "decode",
         "run",
+        "planner",
         "training",
         "device",
     },
