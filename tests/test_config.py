@@ -187,7 +187,7 @@ def test_an_unknown_key_is_refused_and_the_nearest_is_named(
         ("seed: 1\nrun_dir: \x07\n", 2, "characters"),
         ("seed: 1\nrobot: !!python/name:os.system\n", 2, "constructor"),
         ("seed: 1\n? [a]\n: 2\n", 2, "unhashable"),
-        ("seed: *other\n", 1, "undefined alias"),
+        ("seed: &other 1\nskill: *other\n", 2, "aliases are not accepted"),
         ("seed: 1\n---\nseed: 2\n", 2, "document"),
     ],
 )
@@ -196,6 +196,11 @@ def test_malformed_yaml_is_refused_with_file_and_line(tmp_path: Path, text: str,
     message = error_of(path)
     assert message.startswith(f"{path}:{line}: malformed YAML")
     assert word in message
+
+
+def test_a_few_lines_of_aliases_do_not_make_a_long_error(tmp_path: Path) -> None:
+    doubling = "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
+    assert len(error_of(write(tmp_path, f"a0: &a0 [x, x]\n{doubling}seed: *a39\n"))) < 500
 
 
 def test_a_file_nested_too_deeply_is_refused(tmp_path: Path) -> None:

@@ -78,6 +78,17 @@ def load_map(path: str | Path) -> OccupancyMap:
     return _resampled(~free[::-1], resolution, origin)
 
 
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases: a few lines of them stand for values of any size."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(
+                problem="aliases are not accepted", problem_mark=self.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+
 def _read_entries(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
@@ -87,8 +98,9 @@ def _read_entries(path: Path) -> dict[str, Any]:
     if len(text) > MAX_YAML_BYTES:
         raise MapFileError(f"{path}: longer than {MAX_YAML_BYTES} bytes, this is no map_server YAML file")
     try:
-        entries = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        entries = yaml.load(text, Loader=_PlainLoader)
+    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
+        # PyYAML lets through what the constructors of dates and numbers raise
         raise MapFileError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
     if not isinstance(entries, dict):
         raise MapFileError(f"{path}: holds {type(entries).__name__}, it must be a mapping with the keys {_KEYS}")
@@ -201,8 +213,9 @@ def _any_in_cells(occupied: NDArray[np.bool_], axis: int, pixels_per_cell: float
     """Cells of `pixels_per_cell` pixels along one axis, each True if any pixel it overlaps is or it leaves the map."""
     side = occupied.shape[axis]
     cells = max(1, math.ceil(side / pixels_per_cell - 1e-6))
-    first = np.floor(np.arange(cells) * pixels_per_cell + 1e-6).astype(np.intp)
-    stop = np.ceil(np.arange(1, cells + 1) * pixels_per_cell - 1e-6).astype(np.intp)
+    edges = np.minimum(np.arange(cells + 1) * pixels_per_cell, side + 1.0)
+    first = np.floor(edges[:-1] + 1e-6).astype(np.intp)
+    stop = np.ceil(edges[1:] - 1e-6).astype(np.intp)
     shape = [1, 1]
     shape[axis] = cells
     result = np.zeros([cells if k == axis else n for k, n in enumerate(occupied.shape)], dtype=bool)

@@ -156,6 +156,11 @@ def test_a_malformed_entry_is_named(folder: Path, changes: dict[str, object], re
         ("- 1\n- 2\n", "holds list"),
         ("", "holds NoneType"),
         ("#" * 70000, "longer than"),
+        ("image: 2001-99-99", "not a YAML file"),
+        ("image: " + "1" * 5000, "not a YAML file"),
+        ("image: !!timestamp x", "not a YAML file"),
+        ("[" * 5000, "not a YAML file"),
+        ("a: &a [x, x]\nimage: *a", "aliases are not accepted"),
     ],
 )
 def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path, text: str, reason: str) -> None:
@@ -220,3 +225,29 @@ def test_any_bytes_are_a_map_or_a_map_file_error(folder: Path, noise: bytes) -> 
             assert load_map(path).occupied.shape == (2, 3) or not start
         except MapFileError as error:
             assert "noise.pgm" in str(error)
+
+
+@given(st.text(alphabet=st.sampled_from("image: resoluton[]{}&*!|>'\"#%@`,.?~10-9e_\n\t"), max_size=80))
+def test_any_text_is_a_map_file_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(text, newline="")
+    with pytest.raises(MapFileError, match=r"any\.yaml"):
+        load_map(path)
+
+
+ENTRIES = ("resolution", "origin", "negate", "occupied_thresh", "free_thresh", "image", "mode")
+VALUES = ("0", "1", "-1", "0.05", "1e-300", "1e300", ".nan", ".inf", "[]", "[1, 2, 3]", "[a, b, c]", "{}", "null",
+          "text", "true", "2001-01-01", "'../x.pgm'", "'\\0'", "0x7fffffffffffffffffff", "9" * 400)  # fmt: skip
+
+
+@given(st.dictionaries(st.sampled_from(ENTRIES), st.sampled_from(VALUES), min_size=1))
+def test_any_entries_are_a_map_or_a_map_file_error(folder: Path, entries: dict[str, str]) -> None:
+    try:
+        assert load_map(write_map(folder, PICTURE, **entries)).occupied.size > 0
+    except MapFileError as error:
+        assert "hall." in str(error)
+
+
+def test_a_resolution_far_below_any_sensor_costs_no_time(folder: Path) -> None:
+    for resolution in (1e-9, 1e-300):
+        assert load_map(write_map(folder, PICTURE, resolution=resolution)).occupied.tolist() == [[True]]

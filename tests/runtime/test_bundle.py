@@ -290,3 +290,48 @@ def _field(number: int, payload: bytes) -> bytes:
     while size >= 0x80:
         length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
     return bytes([number << 3 | 2]) + length + bytes([size]) + payload
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=200)
+@given(data=st.data())
+def test_a_manifest_with_any_values_is_refused_or_read(tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp() / "fuzzed-manifest"
+    if not folder.exists():
+        folder.mkdir()
+        write_bundle(folder)
+    manifest_path = folder / b.MANIFEST
+    original = manifest_path.read_bytes()
+    values = json.loads(original)
+    for _ in range(data.draw(st.integers(1, 3))):
+        inside = values
+        while isinstance(inside, (dict, list)) and inside:
+            keys = sorted(inside) if isinstance(inside, dict) else list(range(len(inside)))
+            key = data.draw(st.sampled_from(keys))
+            if data.draw(st.booleans()) or not isinstance(inside[key], (dict, list)) or not inside[key]:
+                inside[key] = data.draw(json_values)
+                break
+            inside = inside[key]
+    try:
+        manifest_path.write_text(json.dumps(values))
+        assert b.load_bundle(folder).layout.size >= 0
+    except b.BundleError as error:
+        assert str(error)
+    finally:
+        manifest_path.write_bytes(original)
+
+
+@settings(max_examples=100)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_no_manifest(tmp_path_factory, noise):
+    folder = tmp_path_factory.getbasetemp() / "noise-manifest"
+    folder.mkdir(exist_ok=True)
+    (folder / b.MANIFEST).write_bytes(noise)
+    with pytest.raises(b.BundleError, match=b.MANIFEST):
+        b.load_bundle(folder)

@@ -1,0 +1,159 @@
+"""Records a run as an MCAP file, off the control loop.
+
+The loop only puts records into a queue of limited length; a thread encodes and writes them. A full or failed disk ends
+the recording and not the run. A file that was cut off, as by a killed process, is readable to its last chunk, and a
+chunk is written every second.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import Writer
+
+from hiernav.runtime import messages
+from hiernav.runtime.observe import Event, Observer, TickRecord
+
+PROFILE = "hiernav"
+QUEUE_LENGTH = 1024
+"""Records that may wait; more are dropped and counted."""
+CHUNK_SECONDS = 1.0
+"""Longest time for which a record waits for its chunk to be written [s]."""
+ABOUT = "hiernav"
+"""Name of the metadata record that says what was run."""
+
+log = logging.getLogger(__name__)
+
+
+class Recorder(Observer):
+    """Writes every tick and event to an MCAP file."""
+
+    def __init__(self, path: str | Path, about: Mapping[str, str] | None = None) -> None:
+        """
+        Args:
+            path: file to write; one that exists is left alone.
+            about: what is run, kept as the file's metadata.
+
+        Raises:
+            OSError: the file exists or cannot be written.
+        """
+        self.path = Path(path)
+        if self.path.is_file():
+            raise FileExistsError(f"{self.path}: the recording exists already; choose another name")
+        self._file = self.path.open("wb")
+        self.ticks = self.dropped = 0
+        """Ticks written, and records that found the queue full or could not be encoded."""
+        self.error: str | None = None
+        """Why the recording ended early."""
+        self._queue: queue.SimpleQueue[TickRecord | Event | threading.Event | None] = queue.SimpleQueue()
+        self._encoder = messages.TickEncoder()
+        self._unreadable = False
+        self._writer = Writer(self._file)
+        self._writer.start(profile=PROFILE, library="hiernav")
+        self._writer.add_metadata(ABOUT, dict(about or {}))
+        self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}
+        self._file.flush()
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def tick(self, record: TickRecord) -> None:
+        self._put(record)
+
+    def event(self, event: Event) -> None:
+        self._put(event)
+
+    def flush(self, timeout: float) -> None:
+        written = threading.Event()
+        self._queue.put(written)
+        if self.error is None and not written.wait(timeout):
+            log.warning("%s: not all of the recording could be written within %g s", self.path, timeout)
+
+    def close(self, timeout: float = 5.0) -> None:
+        """Write what waits, at most `timeout` [s] long, and finish the file. May be called again."""
+        self._queue.put(None)
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            self.error = self.error or f"not written within {timeout:g} s"
+
+    def summary(self) -> dict[str, Any]:
+        """For the account of the run, in JSON's own types."""
+        return {"file": str(self.path), "ticks": self.ticks, "dropped": self.dropped, "error": self.error}
+
+    def _put(self, item: TickRecord | Event) -> None:
+        if self.error is not None or self._queue.qsize() >= QUEUE_LENGTH:
+            self.dropped += 1
+        else:
+            self._queue.put(item)
+
+    def _open_channel(self, topic: str) -> int:
+        kind = messages.TOPICS[topic]
+        schema = self._writer.register_schema(f"hiernav.{kind.__name__}", "jsonschema", messages.schema(kind))
+        return self._writer.register_channel(topic, "json", schema)
+
+    def _work(self) -> None:
+        """The thread: everything that takes time or may fail."""
+        try:
+            self._write_all()
+        except Exception as error:
+            self.error = str(error) or type(error).__name__
+            log.error("%s: the recording ends here, the robot drives on: %s", self.path, self.error)
+            # what the buffer still holds cannot be written either
+            try:
+                self._file.close()
+            except OSError:
+                pass
+        self._release_waiting()
+
+    def _write_all(self) -> None:
+        time_ns, chunk_begun = 0, time.monotonic()
+        while True:
+            try:
+                item = self._queue.get(timeout=CHUNK_SECONDS)
+            except queue.Empty:
+                item = threading.Event()
+            if item is None:
+                break
+            if isinstance(item, threading.Event) or time.monotonic() - chunk_begun >= CHUNK_SECONDS:
+                self._writer.flush()
+                chunk_begun = time.monotonic()
+            if isinstance(item, threading.Event):
+                item.set()
+                continue
+            time_ns = max(time_ns, self._time_ns(item))
+            for topic, data in self._encoded(item):
+                self._writer.add_message(self._channels[topic], time_ns, data, time_ns, self.ticks)
+                self.ticks += topic == "/tick"
+        self._writer.finish()
+        self._file.close()
+
+    def _encoded(self, item: TickRecord | Event) -> list[tuple[str, bytes]]:
+        """The item's messages; none if there is something in it that cannot be recorded."""
+        try:
+            if isinstance(item, Event):
+                return [("/event", messages.encode_event(item))]
+            return list(self._encoder.encode(item))
+        except Exception as error:
+            if not self._unreadable:
+                log.error("%s: records that cannot be encoded are left out, such as this one: %s", self.path, error)
+            self._unreadable = True
+            self.dropped += 1
+            return []
+
+    @staticmethod
+    def _time_ns(item: TickRecord | Event) -> int:
+        return round(item.time * 1e9) if 0.0 <= item.time < 1e9 else 0
+
+    def _release_waiting(self) -> None:
+        while True:
+            try:
+                item = self._queue.get_nowait()
+            except queue.Empty:
+                return
+            if isinstance(item, threading.Event):
+                item.set()

@@ -1,0 +1,71 @@
+"""Drives of the shipped point robot on a fake clock, watched and recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hiernav.nav.bundle import load_bundle
+from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.driver import Driver, DriverConfig, RunResult
+from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.policy import make_agent
+from hiernav.runtime.sim_robot import SensorNoise, SimRobot
+from hiernav.sim.layout import GOAL_RADIUS, parse_world
+from hiernav.sim.robots import get_robot
+from hiernav.sim.worlds import sample_layout
+
+BUNDLE = Path(__file__).parents[2] / "deploy" / "bundles" / "point"
+
+
+class Memory(Observer):
+    """Keeps everything it is told."""
+
+    def __init__(self) -> None:
+        self.records: list[TickRecord] = []
+        self.events: list[Event] = []
+
+    def tick(self, record: TickRecord) -> None:
+        self.records.append(record)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+
+def drive(
+    *observers: Observer,
+    seed: int = 0,
+    world: str = "pillar(2,2,10)",
+    max_steps: int | None = None,
+    noise: SensorNoise | None = None,
+) -> RunResult:
+    """Drive the point robot through one world, told to `observers`."""
+    spec, layout = get_robot("point"), sample_layout(parse_world(world), seed, get_robot("point").radius)
+    robot = SimRobot(spec, layout, noise, seed)
+    driver = Driver(
+        robot,
+        make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS),
+        robot.occupancy,
+        FakeClock(),
+        Estimator(EstimatorConfig(tilts=False)),
+        config=DriverConfig(goal_radius=GOAL_RADIUS, max_steps=layout.spec.max_steps),
+        observers=observers,
+    )
+    try:
+        return driver.run(layout.goal, max_steps)
+    finally:
+        robot.close()
+
+
+def equal(a: object, b: object) -> bool:
+    """Whether two values are the same bit for bit, arrays and NaN included."""
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        same = np.asarray(a).dtype == np.asarray(b).dtype and np.asarray(a).shape == np.asarray(b).shape
+        return same and np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    if hasattr(a, "__dataclass_fields__") and type(a) is type(b):
+        return all(equal(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
+    return a == b or (a != a and b != b)
