@@ -17,6 +17,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -37,6 +38,9 @@ from hiernav.runtime.summary import Episode, print_summary, summarise
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.worlds import sample_layout
+
+if TYPE_CHECKING:
+    from hiernav.runtime.recorder import Recorder
 
 BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE = 0, 1, 2, 3
@@ -110,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--goal", metavar="X,Y", help="goal in the world frame [m]; the world's own by default")
     parser.add_argument("--exact", action="store_true", help="sensors without noise")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/drive-TIME)")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file with every tick (hiernav replay FILE)")
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary here too")
     return parser
@@ -136,6 +141,7 @@ def _run(arguments: argparse.Namespace) -> int:
         guard,
         DriverConfig(goal_radius=GOAL_RADIUS, max_steps=world.max_steps),
     )
+    recorder = _open_recorder(arguments, driver, bundle, spec)
     out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
     out.mkdir(parents=True, exist_ok=True)
     granted = {} if arguments.fast else request_realtime()
@@ -146,7 +152,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people to look at
             driver.supervisor.acknowledge(clock.now())
         drive = Drive(robot)
-        driver.audience.observers = [drive]
+        driver.audience.observers = [drive, *filter(None, [recorder])]
         result = driver.run(layout.goal)
         truth = robot.truth()
         distance = float(np.linalg.norm(truth.pose[:2] - layout.goal))
@@ -160,8 +166,11 @@ def _run(arguments: argparse.Namespace) -> int:
         if driver.interrupted:
             break
     robot.close()
+    if recorder is not None:
+        recorder.close()
 
     summary = summarise(episodes, driver.timer, driver.loop, granted)
+    summary["recording"] = None if recorder is None else recorder.summary()
     summary["startup_seconds"] = drives[0].first_tick_age
     for file in filter(None, (out / "summary.json", arguments.json)):
         file.write_text(json.dumps(summary, indent=2) + "\n")
@@ -171,6 +180,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 layout, out / f"drive-{layout.seed}.png", f"{world}, seed {layout.seed}: {episode.result.reason}"
             )
     print_summary(summary, console)
+    if recorder is not None:
+        console.print(f"recording: {recorder}", highlight=False)
     console.print(f"run folder: {out}", highlight=False)
     return FAULT if any(episode.result.fault for episode in episodes) else OK
 
@@ -181,6 +192,27 @@ def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
     bundle.require_robot(spec.name, file_sha256(spec.xml_path))
     bundle.require_layout(observation_layout(spec.name, clock="clock" in bundle.layout.names))
     return bundle
+
+
+def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle, spec: RobotSpec) -> Recorder | None:
+    if arguments.record is None:
+        return None
+    from hiernav.runtime.about import About
+    from hiernav.runtime.recorder import Recorder
+
+    about = About(
+        robot=spec.name,
+        robot_radius=spec.radius,
+        goal_radius=driver.config.goal_radius,
+        control_period=spec.control_period,
+        bundle=str((arguments.bundle or BUNDLES / spec.name).resolve()),
+        hashes=dict(bundle.manifest.files),
+        planner_process=driver.pilot.link is not None,
+        estimator=driver.estimator.config,
+        guard=driver.guard.config,
+        world=f"{arguments.world}, seed {arguments.seed}, {arguments.episodes} episodes",
+    )
+    return Recorder(arguments.record, about.metadata())
 
 
 def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | None) -> Layout:

@@ -1,12 +1,13 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
-Exit codes: 0 done; 1 training diverged or lost its workers; 2 bad input, with one line that says what to do;
-130 interrupted.
+Exit codes: 0 done; 1 training diverged or lost its workers, or a replay differs; 2 bad input, with one line that says
+what to do; 130 interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -145,6 +146,17 @@ def _parser() -> argparse.ArgumentParser:
         help="write a bundle of ONNX files; DIR is replaced if it holds one (RUN/bundle)",
     )
     export.set_defaults(run=_export)
+
+    replay = commands.add_parser(
+        "replay",
+        help="run the policies again on a recording",
+        description="Run estimator, planner, skill and guard again on what a recording (run_loop.py --record) says "
+        "they were given, and compare bit for bit. Exit code 1 if a tick differs.",
+    )
+    replay.add_argument("recording", metavar="RUN.mcap", help="the recording")
+    replay.add_argument("--bundle", metavar="DIR", help="policies (those of the recording)")
+    replay.add_argument("--json", metavar="FILE", help="write the result; - for the screen")
+    replay.set_defaults(run=_replay)
 
     world = commands.add_parser(
         "world", help="draw a world", description="Sample a world from a seed and draw it, or print it as JSON."
@@ -307,6 +319,44 @@ def _export(arguments: argparse.Namespace) -> int:
     total = sum(file.stat().st_size for file in out.iterdir())
     print(f"{out}: {', '.join(sorted(file.name for file in out.iterdir()))}; {total / 1e6:.2f} MB, checked")
     return 0
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from hiernav.nav.bundle import load_bundle
+    from hiernav.runtime.log_reader import RunLog
+    from hiernav.runtime.replay import Replay
+
+    log = RunLog(arguments.recording)
+    replay = Replay(log, load_bundle(arguments.bundle or log.about.get("bundle", "")))
+    with _progress() as progress:
+        task = progress.add_task("ticks", total=sum(1 for _ in log.ticks()), note="")
+        result = replay.compare(lambda ticks: progress.update(task, completed=ticks))
+        progress.update(task, completed=result.ticks)
+    difference = result.difference
+    found = {
+        "recording": arguments.recording,
+        "equal": result.equal,
+        "ticks": result.ticks,
+        "compared": result.compared,
+        "same_policies": replay.same_policies,
+        "complete": log.complete if result.equal else None,
+        "difference": None if difference is None else dataclasses.asdict(difference),
+    }
+    if arguments.json == "-":
+        print(json.dumps(found, indent=2))
+        return 0 if result.equal else FAILED
+    if not replay.same_policies:
+        print("the policies are not those of the recording")
+    if difference is not None:
+        print(f"after {result.ticks} equal ticks: {difference}")
+    else:
+        compared = ", ".join(f"{count} x {name}" for name, count in result.compared.items()) or "nothing"
+        print(f"{result.ticks} ticks equal bit for bit: {compared}")
+        if not log.complete:
+            print("the recording is cut off there: what came later was not written, or is damaged")
+    if arguments.json:
+        _write_json(Path(arguments.json), found)
+    return 0 if result.equal else FAILED
 
 
 def _world(arguments: argparse.Namespace) -> int:

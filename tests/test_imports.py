@@ -25,7 +25,7 @@ ALLOWED = {
     "planner": {"nav", "sim", "config", "run", "device"},
     "skill": {"nav", "sim", "config", "run", "device"},
     "training": {"nav", "planner", "skill", "run"},
-    "runtime": {"nav", "decode"},
+    "runtime": {"nav", "decode", "__init__"},
     "evaluate": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
@@ -45,6 +45,7 @@ ALLOWED = {
         "planner",
         "training",
         "device",
+        "runtime",
     },
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}

@@ -344,7 +344,7 @@ def _state(estimate: Estimate) -> State:
         covariance=_numbers(estimate.covariance[_UPPER]),
         upright=_number(estimate.upright),
         yaw_rate=_number(estimate.yaw_rate),
-        trust=int(estimate.trust),
+        trust=int(estimate.trust),  # type: ignore[arg-type]
         why=estimate.why,
         restarts=estimate.restarts,
     )

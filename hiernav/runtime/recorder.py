@@ -46,6 +46,7 @@ class Recorder(Observer):
         self.path = Path(path)
         if self.path.is_file():
             raise FileExistsError(f"{self.path}: the recording exists already; choose another name")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = self.path.open("wb")
         self.ticks = self.dropped = 0
         """Ticks written, and records that found the queue full or could not be encoded."""
@@ -84,6 +85,11 @@ class Recorder(Observer):
     def summary(self) -> dict[str, Any]:
         """For the account of the run, in JSON's own types."""
         return {"file": str(self.path), "ticks": self.ticks, "dropped": self.dropped, "error": self.error}
+
+    def __str__(self) -> str:
+        lost = f", {self.dropped} left out" if self.dropped else ""
+        ended = f", ended early: {self.error}" if self.error else ""
+        return f"{self.path}, {self.ticks} ticks{lost}{ended}"
 
     def _put(self, item: TickRecord | Event) -> None:
         if self.error is not None or self._queue.qsize() >= QUEUE_LENGTH:

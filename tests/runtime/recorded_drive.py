@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from hiernav.nav.bundle import load_bundle
+from hiernav.runtime.about import About
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver, DriverConfig, RunResult
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.guard import GuardConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.sim_robot import SensorNoise, SimRobot
 from hiernav.sim.layout import GOAL_RADIUS, parse_world
@@ -34,6 +37,25 @@ class Memory(Observer):
         self.events.append(event)
 
 
+ESTIMATOR = EstimatorConfig(tilts=False)
+
+
+def about() -> About:
+    """What a recording of `drive` says of itself."""
+    spec, bundle = get_robot("point"), load_bundle(BUNDLE)
+    return About(
+        robot="point",
+        robot_radius=spec.radius,
+        goal_radius=GOAL_RADIUS,
+        control_period=spec.control_period,
+        bundle=str(BUNDLE),
+        hashes=dict(bundle.manifest.files),
+        planner_process=False,
+        estimator=ESTIMATOR,
+        guard=GuardConfig(),
+    )
+
+
 def drive(
     *observers: Observer,
     seed: int = 0,
@@ -46,10 +68,10 @@ def drive(
     robot = SimRobot(spec, layout, noise, seed)
     driver = Driver(
         robot,
-        make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS),
+        Pilot(make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS)),
         robot.occupancy,
         FakeClock(),
-        Estimator(EstimatorConfig(tilts=False)),
+        Estimator(ESTIMATOR),
         config=DriverConfig(goal_radius=GOAL_RADIUS, max_steps=layout.spec.max_steps),
         observers=observers,
     )

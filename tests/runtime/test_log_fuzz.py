@@ -1,4 +1,4 @@
-"""Recordings from strangers: whatever the bytes, the reader gives records or one LogError, and takes no undue memory."""
+"""Recordings from strangers: whatever the bytes, the reader gives records or one LogError, in little memory."""
 
 from __future__ import annotations
 

@@ -1,0 +1,247 @@
+"""Runs the policies again on what a recording says they were given, and compares bit for bit.
+
+Every tick's frame goes through the estimator again, its estimate and map through option, planner and skill, and what
+the skill said through the guard. Each of them is given what was recorded, not what the one before it computed again:
+what differs first is where a difference comes from.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hiernav.nav.bundle import Bundle
+from hiernav.nav.occupancy import VisitMap
+from hiernav.nav.option import Planner, PlanQuery
+from hiernav.runtime.about import About
+from hiernav.runtime.estimate import Estimate
+from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.guard import Guard
+from hiernav.runtime.log_reader import LogError, RunLog
+from hiernav.runtime.observe import Event, TickRecord
+from hiernav.runtime.policy import load_policies, make_agent, make_planner
+from hiernav.runtime.supervisor import Mode
+from hiernav.runtime.terms import TermHold
+
+ASKED = 256
+"""Questions to the planner that are kept until the answer to one of them comes."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first value that came out otherwise."""
+
+    run: int
+    tick: int
+    """As `TickRecord.index`, from the start of that run."""
+    time: float
+    """On the loop's clock [s]."""
+    value: str
+    """estimate, reason, plan, observation, proposed or sent."""
+    recorded: str
+    replayed: str
+
+    def __str__(self) -> str:
+        return (
+            f"run {self.run}, tick {self.tick} ({self.time:.3f} s): {self.value} is {self.replayed}, "
+            f"recorded was {self.recorded}"
+        )
+
+
+@dataclass
+class Comparison:
+    """How far recording and replay agree."""
+
+    ticks: int = 0
+    """Ticks read."""
+    compared: dict[str, int] = field(default_factory=dict)
+    """Values compared, by name."""
+    difference: Difference | None = None
+    complete: bool = False
+    """Whether the recording is whole."""
+
+    @property
+    def equal(self) -> bool:
+        return self.difference is None
+
+
+class Replay:
+    """The deciding part of a runtime, fed from a recording."""
+
+    def __init__(self, log: RunLog, bundle: Bundle) -> None:
+        """
+        Args:
+            log: what was recorded.
+            bundle: verified policies; others than the recorded ones may be tried as well.
+
+        Raises:
+            LogError: the recording does not say enough of its run, or is of another robot.
+            BundleError: the policies cannot be loaded.
+        """
+        self.log = log
+        try:
+            self.about = about = About.from_metadata(log.about)
+        except ValueError as error:
+            raise LogError(f"{log.path}: {error}") from None
+        if about.robot != bundle.manifest.robot:
+            raise LogError(f"{log.path}: a drive of {about.robot!r}, and a bundle for {bundle.manifest.robot!r}")
+        self.same_policies = about.hashes == bundle.manifest.files
+        self._planner = make_planner(bundle, load_policies(bundle).planner, about.robot_radius)
+        self._asked = _Asked() if about.planner_process else None
+        self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked)
+        self._estimator = Estimator(about.estimator)
+        self._guard = Guard(bundle.golden["action"].shape[1], about.guard)
+        self._mode = Mode.INIT
+        self._begin()
+
+    def compare(self, progress: Callable[[int], None] = lambda ticks: None) -> Comparison:
+        """Go through the recording up to the first difference.
+
+        Args:
+            progress: called with the number of ticks so far, every hundred ticks.
+
+        Raises:
+            LogError: what was recorded cannot have happened.
+        """
+        result = Comparison()
+        try:
+            self._compare(result, progress)
+        except LogError:
+            raise
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise LogError(
+                f"{self.log.path}: after {result.ticks} ticks, what cannot have happened: {error}"
+            ) from error
+        result.complete = self.log.complete
+        return result
+
+    def _compare(self, result: Comparison, progress: Callable[[int], None]) -> None:
+        run = -1
+        for item in self.log:
+            if isinstance(item, Event):
+                self._happened(item)
+                continue
+            if item.index == 0 or run < 0:
+                run += 1
+                self._begin()
+            for name, recorded, replayed in self._values(item):
+                result.compared[name] = result.compared.get(name, 0) + 1
+                if not _same(recorded, replayed):
+                    texts = _texts(recorded, replayed)
+                    result.difference = Difference(run, item.index, item.time, name, *texts)
+                    return
+            result.ticks += 1
+            if result.ticks % 100 == 0:
+                progress(result.ticks)
+
+    def _begin(self) -> None:
+        """The loop was started: the estimator knows nothing."""
+        self._estimator.reset()
+        self._terms = TermHold()
+        self._waits = False
+
+    def _happened(self, event: Event) -> None:
+        option = self._agent.option
+        if event.kind == "goal" and "x" in event.values:
+            self._agent.reset()
+            self._guard.reset()
+        elif event.kind == "plan":
+            option.drop()
+        elif event.kind == "mode":
+            recovered = self._mode is Mode.RECOVERING and event.values.get("mode") == Mode.RUNNING.value
+            self._waits |= recovered
+            self._mode = Mode(event.values["mode"])
+
+    def _values(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
+        """Name, recorded and replayed value of everything that was computed in a tick."""
+        estimate = self._estimator.update(tick.frame)
+        yield "estimate", _state(tick.estimate), _state(estimate)
+        if tick.observation is not None:
+            yield from self._decision(tick)
+        if tick.sent is not None and tick.proposed is not None:
+            action = -tick.proposed if tick.mode is Mode.RECOVERING else tick.proposed
+            upright = None if tick.estimate is None else tick.estimate.upright
+            yield "sent", tick.sent, self._guard.check(action, upright, speed=tick.speed_scale).action
+        if self._waits:
+            # as after a recovery: another plan is asked for at the next tick
+            self._agent.option.waiting[0], self._waits = True, False
+
+    def _decision(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
+        if tick.estimate is None or tick.goal is None or tick.occupancy is None:
+            raise LogError(f"{self.log.path}: tick {tick.index} decided without estimate, goal or map")
+        if self._asked is not None:
+            self._asked.stamp = tick.estimate.stamp
+            if tick.replanned:
+                yield from self._answer(tick, self._asked)
+        terms = self._terms.fill(tick.frame)
+        step = self._agent.act(tick.estimate.pose[None], terms, tick.goal[None], (tick.occupancy,))
+        yield "reason", int(tick.reason), int(step.reason[0])
+        yield "plan", tick.plan, step.plan[0]
+        yield "observation", tick.observation, step.observation[0]
+        yield "proposed", tick.proposed, step.proposed[0]
+
+    def _answer(self, tick: TickRecord, asked: _Asked) -> Iterator[tuple[str, object, object]]:
+        """A plan arrived that was asked for earlier: plan again from the state it was made from, then follow it."""
+        query = asked.queries.get(tick.plan_stamp)
+        if query is None or tick.plan is None or tick.plan_start is None:
+            yield "plan", tick.plan, None
+            return
+        yield "plan", tick.plan, np.asarray(self._planner.plan(query), dtype=np.float64)[0]
+        self._agent.option.adopt(0, tick.plan, tick.plan_start, query.occupancy[0])
+
+
+class _Asked(Planner):
+    """In the place of a planner in its own process: keeps what it was asked."""
+
+    def __init__(self) -> None:
+        self.stamp = 0.0
+        self.queries: dict[float | None, PlanQuery] = {}
+        self._order: deque[float] = deque()
+
+    def plan(self, query: PlanQuery) -> None:  # type: ignore[override]
+        if len(self._order) == ASKED:
+            del self.queries[self._order.popleft()]
+        self._order.append(self.stamp)
+        self.queries[self.stamp] = PlanQuery(
+            query.position.copy(),
+            query.goal.copy(),
+            list(query.occupancy),
+            [_copy(visits) for visits in query.visits],
+            query.previous.copy(),
+        )
+
+
+def _copy(visits: VisitMap) -> VisitMap:
+    copied = VisitMap.__new__(VisitMap)
+    copied.__dict__.update(visits.__dict__)
+    copied.counts = visits.counts.copy()
+    return copied
+
+
+def _state(estimate: Estimate | None) -> object:
+    if estimate is None:
+        return None
+    return np.concatenate(
+        [estimate.pose, estimate.velocity, estimate.covariance.ravel(), [estimate.upright, estimate.yaw_rate]]
+    )
+
+
+def _same(recorded: object, replayed: object) -> bool:
+    if isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray):
+        return recorded.shape == replayed.shape and recorded.astype(replayed.dtype).tobytes() == replayed.tobytes()
+    return type(recorded) is type(replayed) and recorded == replayed
+
+
+def _texts(recorded: object, replayed: object) -> tuple[str, str]:
+    """Both values; of arrays the first element that differs."""
+    if isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray) and recorded.shape == replayed.shape:
+        ours, theirs = recorded.ravel(), replayed.ravel()
+        bits = ours.astype(theirs.dtype).view(np.uint8).reshape(len(ours), -1) != theirs.view(np.uint8).reshape(
+            len(theirs), -1
+        )
+        k = int(np.flatnonzero(bits.any(axis=1))[0])
+        return f"{float(ours[k])!r} (element {k})", repr(float(theirs[k]))
+    return str(recorded), str(replayed)

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+from recorded_drive import BUNDLE, about, drive
+
+from hiernav import cli
+from hiernav.nav.bundle import Bundle, load_bundle
+from hiernav.runtime.log_reader import LogError, RunLog
+from hiernav.runtime.observe import Observer
+from hiernav.runtime.policy import OnnxSkill
+from hiernav.runtime.recorder import Recorder
+from hiernav.runtime.replay import Replay
+from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.sim_robot import SensorNoise
+
+
+def recorded(path, *runs, change=lambda record: record):
+    """A recording of several runs, each given as keywords of `drive`."""
+    recorder = Recorder(path, about().metadata())
+
+    class Changed(Observer):
+        def tick(self, record):
+            recorder.tick(change(record))
+
+        event = recorder.event
+
+    for run in runs:
+        drive(Changed(), **run)
+    recorder.close()
+    return RunLog(path)
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    return load_bundle(BUNDLE)
+
+
+def test_everything_that_was_decided_is_decided_again_bit_for_bit(tmp_path, bundle):
+    noisy = SensorNoise(dropout=0.1, fix_dropout=0.2, fix_latency=0.06)
+    log = recorded(tmp_path / "run.mcap", {"seed": 1}, {"seed": 2, "world": "gremlin"}, {"seed": 3, "noise": noisy})
+    replay = Replay(log, bundle)
+    result = replay.compare()
+    assert result.equal and result.complete and replay.same_policies, result.difference
+    assert result.ticks == sum(1 for _ in log.ticks())
+    assert result.compared["estimate"] == result.ticks
+    assert result.compared["proposed"] == result.compared["plan"] > 150
+    assert result.compared["sent"] > 150
+
+
+@pytest.mark.parametrize(
+    ("value", "change"),
+    [
+        ("sent", lambda r: replace(r, sent=np.nextafter(r.sent, 9.0)) if r.sent is not None else r),
+        ("proposed", lambda r: replace(r, proposed=-r.proposed) if r.proposed is not None else r),
+        ("observation", lambda r: replace(r, observation=r.observation * np.float32(1.01))
+         if r.observation is not None else r),
+        ("plan", lambda r: replace(r, plan=r.plan + 1e-15) if r.plan is not None else r),
+    ],
+)  # fmt: skip
+def test_the_first_tick_that_differs_is_named_to_the_last_bit(tmp_path, bundle, value, change):
+    """What is decided in tick 30 is changed in the recording by as little as can be."""
+    log = recorded(
+        tmp_path / "run.mcap",
+        {"seed": 1, "max_steps": 60},
+        change=lambda record: change(record) if record.index == 30 else record,
+    )
+    difference = Replay(log, bundle).compare().difference
+    assert (difference.run, difference.tick, difference.value) == (0, 30, value)
+    assert f"run 0, tick 30 (0.600 s): {value} is" in str(difference)
+
+
+def test_a_changed_sensor_value_shows_in_the_estimate(tmp_path, bundle):
+    def change(record):
+        if record.index != 20:
+            return record
+        frame: SensorFrame = record.frame
+        return replace(record, frame=replace(frame, gyro=frame.gyro + 1e-12))
+
+    log = recorded(tmp_path / "run.mcap", {"seed": 1, "max_steps": 40}, change=change)
+    difference = Replay(log, bundle).compare().difference
+    assert (difference.tick, difference.value) == (20, "estimate")
+
+
+def test_other_policies_are_found_out_at_their_first_other_action(tmp_path, bundle):
+    log = recorded(tmp_path / "run.mcap", {"seed": 1, "max_steps": 20})
+    model = onnx.load_from_string(bundle.skill)
+    weight = max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+    weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * np.float32(1.001), weight.name))
+    skill = model.SerializeToString()
+    golden = dict(bundle.golden) | {"action": OnnxSkill(skill)(bundle.golden["observation"])}
+    manifest = msgspec.structs.replace(bundle.manifest, files={**bundle.manifest.files, "skill.onnx": "0" * 64})
+    replay = Replay(log, Bundle(manifest, bundle.planner, skill, golden))
+    difference = replay.compare().difference
+    assert not replay.same_policies
+    assert (difference.tick, difference.value) == (0, "proposed")
+
+
+def test_a_recording_that_does_not_say_what_was_run_is_refused(tmp_path, bundle):
+    recorder = Recorder(tmp_path / "silent.mcap")
+    recorder.close()
+    with pytest.raises(LogError, match="what it says of its run"):
+        Replay(RunLog(recorder.path), bundle)
+
+
+def test_a_recording_of_another_robot_is_refused(tmp_path, bundle):
+    recorder = Recorder(tmp_path / "car.mcap", {**about().metadata(), "robot": "car"})
+    recorder.close()
+    with pytest.raises(LogError, match="a drive of 'car', and a bundle for 'point'"):
+        Replay(RunLog(recorder.path), bundle)
+
+
+def test_the_command_says_equal_different_or_refused(tmp_path, capsys):
+    run = {"seed": 1, "max_steps": 8}
+    good = recorded(tmp_path / "good.mcap", run)
+    assert cli.main(["replay", str(good.path)]) == 0
+    assert "ticks equal bit for bit" in capsys.readouterr().out
+    assert cli.main(["replay", str(good.path), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["equal"] is True
+    wrong = recorded(
+        tmp_path / "wrong.mcap", run, change=lambda r: replace(r, sent=r.sent + 0.5) if r.index == 3 else r
+    )
+    assert cli.main(["replay", str(wrong.path)]) == 1
+    assert "after 3 equal ticks: run 0, tick 3" in capsys.readouterr().out
+    (tmp_path / "cut.mcap").write_bytes(good.path.read_bytes()[:100])
+    assert cli.main(["replay", str(tmp_path / "cut.mcap")]) == 2
+    assert "not a recording" in capsys.readouterr().err
