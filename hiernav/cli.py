@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from hiernav.run import TrainingDiverged, WorkersLost
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.progress import Progress
 
     from hiernav.config import TrainConfig
@@ -29,7 +30,11 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     parser = _parser()
-    arguments = parser.parse_args(argv)
+    arguments, more = parser.parse_known_args(argv)
+    if more:
+        if "overrides" not in arguments or any(text.startswith("-") for text in more):
+            parser.error(f"unrecognized arguments: {' '.join(more)}")
+        arguments.overrides += more  # argparse itself takes one group of KEY=VALUE, but no second one after an option
     try:
         return arguments.run(arguments) or 0
     except KeyboardInterrupt:
@@ -391,7 +396,6 @@ def _config(arguments: argparse.Namespace) -> int:
     if arguments.config or arguments.overrides:
         print(dump_config(load_config(arguments.config, arguments.overrides)), end="")
         return 0
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -399,10 +403,7 @@ def _config(arguments: argparse.Namespace) -> int:
     for setting in describe_config():
         # escaped: units in brackets are no markup
         table.add_row(*map(escape, (setting.path, setting.type, str(setting.default), setting.description)))
-    console = Console()
-    if not console.is_terminal:
-        console.width = 1_000  # one line per setting, for grep
-    console.print(table)
+    _console(piped_width=1_000).print(table)  # one line per setting, for grep
     return 0
 
 
@@ -444,7 +445,6 @@ def _check_machine(config: TrainConfig) -> None:
 
 
 def _print_results(results: dict[str, dict[str, Any]]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     first = next(iter(results.values()))
@@ -464,9 +464,7 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
             f"{row['collision_free_rate']:.3f}",
             f"{row['spl_mean']:.3f}",
         )
-    console = Console()
-    if not console.is_terminal:
-        console.width = 120
+    console = _console()
     console.print(table)
     for name, row in results.items():
         replans = ", ".join(f"{reason} {count}" for reason, count in row["replans"].items())
@@ -487,7 +485,6 @@ def _write_json(path: Path, value: Any) -> None:
 
 @contextmanager
 def _progress() -> Iterator[Progress]:
-    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -505,7 +502,7 @@ def _progress() -> Iterator[Progress]:
         TextColumn("left"),
         TimeRemainingColumn(compact=True, elapsed_when_finished=False),
         TextColumn("{task.fields[note]}"),
-        console=Console(stderr=True),
+        console=_console(stderr=True),
     )
     with progress:
         try:
@@ -515,6 +512,16 @@ def _progress() -> Iterator[Progress]:
             progress.live.transient = True
             progress.console.quiet = not progress.console.is_interactive
             raise
+
+
+def _console(stderr: bool = False, piped_width: int = 120) -> Console:
+    """As wide as the terminal, or as `piped_width` columns where there is none."""
+    from rich.console import Console
+
+    console = Console(stderr=stderr)
+    if not console.is_terminal:
+        console.width = piped_width
+    return console
 
 
 def _one_line(error: Exception) -> str:

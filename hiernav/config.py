@@ -98,7 +98,10 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ] = False
     ray_address: Annotated[
         Annotated[str, Meta(min_length=1)] | None,
-        Meta(description="Cluster of collector ray; null: $RAY_ADDRESS, one that runs here, or a new one here."),
+        Meta(
+            description="Cluster of collector ray; null: $RAY_ADDRESS, one that runs here, or a new one here; "
+            "local: a new one here."
+        ),
     ] = None
     total_steps: Annotated[int, Meta(ge=1, description="Control steps in all, summed over simulations.")] = 200_000
     learning_starts: Annotated[int, Meta(ge=0, description="Steps with random actions before the first update.")] = (

@@ -262,6 +262,16 @@ def test_config_lists_every_setting_on_a_line_of_its_own(capsys):
         assert setting.description in line and setting.type in line
 
 
+def test_settings_may_stand_between_and_after_options(tmp_path, capsys):
+    (tmp_path / "robot.yaml").write_text("robot: car\n")
+    assert cli.main(["config", "skill.tau=0.03", "--config", str(tmp_path / "robot.yaml"), "seed=4"]) == 0
+    assert {"robot: car", "  tau: 0.03", "seed: 4"} <= set(capsys.readouterr().out.splitlines())
+    for arguments in (["config", "seed=4", "--confg", "x"], ["world", "seed=4"]):
+        with pytest.raises(SystemExit):
+            cli.main(arguments)
+        assert "unrecognized arguments" in capsys.readouterr().err
+
+
 def test_config_resolves_a_file_and_what_overrides_it(tmp_path, capsys):
     (tmp_path / "robot.yaml").write_text("robot: car\nskill: {tau: 0.02, num_envs: 4}\n")
     assert cli.main(["config", "--config", str(tmp_path / "robot.yaml"), "skill.tau=0.03"]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import warnings
 from functools import partial
@@ -82,7 +83,7 @@ def find_machines(config: TrainConfig, share: int, planner: Planner | None) -> M
     """The machines that `skill.collector` names, for workers that deliver `share` steps at a time.
 
     Raises:
-        ConfigError: they have too few processors.
+        ConfigError: they cannot be joined, or have too few processors.
     """
     return (Cluster if config.skill.collector == "ray" else Processes)(config, share, planner)
 
@@ -128,7 +129,16 @@ class Cluster:
         )
         self._joined = not ray.is_initialized()
         if self._joined:
-            ray.init(config.skill.ray_address, include_dashboard=False, logging_level=logging.WARNING)
+            # Ray ranks workers behind all else on a machine; here the trainer waits for them
+            os.environ.setdefault("RAY_worker_niceness", "0")
+            address = config.skill.ray_address
+            try:
+                ray.init(address, include_dashboard=False, logging_level=logging.WARNING)
+            except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+                raise ConfigError(
+                    f"skill.ray_address = {address!r}: {str(error).strip()}; is `ray start --head` running there, and "
+                    "are its token and RAY_AUTH_MODE set here? (see docs/cluster.md)"
+                ) from error
         there, needed = int(ray.cluster_resources().get("CPU", 0)), config.skill.workers * config.threads
         if there < needed:
             self.close()

@@ -122,8 +122,8 @@ class Worker:
                     raise WorkersLost(
                         f"worker {self.index} died {deaths} times without delivering anything, at last of: {error}"
                     ) from error
-                reason = str(error).partition("\n")[0]
-                log.warning("worker %d died and is replaced; torchrl says: %s", self.index, reason)
+                reason = str(error).partition("\n")[0] or type(error).__name__
+                log.warning("worker %d died and is replaced: %s", self.index, reason)
 
     def stop(self) -> None:
         """End the worker; the next share is collected by a new one."""

@@ -88,7 +88,7 @@ def test_a_worker_that_dies_is_replaced_by_one_in_worlds_of_its_own(config, capl
     worker = Worker(1, config, machines)
     collected = [worker.collect(order()) for _ in range(4)]
     assert places(*collected) == [(0, 1, 0), (0, 1, 0), (0, 1, 1), (0, 1, 1)]
-    assert caplog.messages == ["worker 1 died and is replaced; torchrl says: gone"]
+    assert caplog.messages == ["worker 1 died and is replaced: gone"]
     assert machines.stopped == 1
 
 
