@@ -36,6 +36,10 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     preset: Annotated[Literal["default", "paper"], Meta(description="`paper`: the published network.")] = "default"
     samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 40_000
+    data: Annotated[
+        Annotated[str, Meta(min_length=1)] | None,
+        Meta(description="Folder that `hiernav dataset` has made to take them from; null: make them for the run."),
+    ] = None
     samples_per_world: Annotated[int, Meta(ge=1, description="Starts labelled by one shortest-path field.")] = 100
     epochs: Annotated[int, Meta(ge=1, description="Passes over the data set.")] = 6
     batch_size: Annotated[int, Meta(ge=1, description="Samples per update.")] = 256

@@ -34,8 +34,9 @@ from hiernav.nav.bundle import (
 )
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import RESOLUTION
+from hiernav.planner.dataset import label_settings
 from hiernav.planner.network import HypothesisNetwork, PaperNetwork
-from hiernav.planner.train import label_settings, load_network, torch_planner
+from hiernav.planner.train import load_network, torch_planner
 from hiernav.run import Run, RunError
 from hiernav.runtime.policy import check_golden
 from hiernav.sim.factory import make_task, skill_layout

@@ -14,11 +14,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from hiernav.config import TrainConfig
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.search import PathField, random_shortcuts, resample
 from hiernav.planner.mix import WorldMix
 from hiernav.sim.layout import WorldSpec
+from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
 
 T = TypeVar("T")
@@ -94,6 +96,27 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.label)
+
+
+def label_settings(config: TrainConfig) -> LabelSettings:
+    """How a configuration's samples are labelled."""
+    planner, option = config.planner, config.option
+    paper = planner.preset == "paper"
+    return LabelSettings(
+        worlds=planner.worlds,
+        radius=planner.planning_radius_m or get_robot(config.robot).radius,
+        soft_margin=planner.soft_margin_m,
+        waypoints=option.waypoints,
+        spacing=option.spacing_m,
+        samples_per_world=planner.samples_per_world,
+        random_smoothing=paper,
+        channels=goselo.CHANNELS if paper else goselo.METRIC_CHANNELS,
+    )
+
+
+def data_seed(config: TrainConfig) -> tuple[int, ...]:
+    """What the samples of a configuration are drawn from."""
+    return config.seed, 4
 
 
 def make_samples(

@@ -84,13 +84,8 @@ class TorchNetwork:
         return waypoints.cpu().numpy(), scores.cpu().numpy()
 
 
-def network_class(preset: str) -> type[PaperNetwork] | type[HypothesisNetwork]:
-    """Which network a preset, "paper" or "default", stands for."""
-    return PaperNetwork if preset == "paper" else HypothesisNetwork
-
-
 def make_network(preset: str, waypoints: int, spacing: float, hypotheses: int) -> PaperNetwork | HypothesisNetwork:
-    """A new network of a preset."""
+    """A new network of a preset, "paper" or "default"."""
     if preset == "paper":
         return PaperNetwork(waypoints)
     return HypothesisNetwork(waypoints, spacing, hypotheses)

@@ -22,7 +22,7 @@ from hiernav.device import (
 )
 from hiernav.nav import goselo
 from hiernav.nav.planners import GoseloPlanner
-from hiernav.planner.dataset import LabelSettings, Samples, make_samples
+from hiernav.planner.dataset import LabelSettings, Samples, data_seed, label_settings, make_samples
 from hiernav.planner.mix import WorldMix
 from hiernav.planner.network import (
     HypothesisNetwork,
@@ -30,10 +30,9 @@ from hiernav.planner.network import (
     PaperNetwork,
     TorchNetwork,
     make_network,
-    network_class,
 )
+from hiernav.planner.store import DatasetError, read_dataset, read_manifest
 from hiernav.run import Run, TrainingDiverged
-from hiernav.sim.robots import get_robot
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
 
@@ -73,6 +72,8 @@ class PlannerTrainer:
         ).to(self.device, memory_format=torch.channels_last)
         self.precision = choose_precision(planner.precision, self.device)
         self.labels = label_settings(config)
+        if planner.data is not None:
+            self.labels = _settings_of(planner.data, self.labels)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=planner.learning_rate, weight_decay=planner.weight_decay
         )
@@ -117,13 +118,13 @@ class PlannerTrainer:
                 rate = (done - first) / max(time.perf_counter() - began, 1e-6)
                 on_progress(Progress(stage, done, total, rate, loss, self.validation.get("error")))
 
-        samples = make_samples(
-            self.labels,
-            planner.samples,
-            (seed, 4),
-            self.config.threads,
-            lambda done: report("data set", done, planner.samples),
-        )
+        def made(done: int) -> None:
+            report("data set", done, planner.samples)
+
+        if planner.data is not None:
+            samples = read_dataset(planner.data, planner.samples, made)
+        else:
+            samples = make_samples(self.labels, planner.samples, data_seed(self.config), self.config.threads, made)
         held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
         keep_freed_memory()  # after the samples, which are freed for good
         began, first, total = time.perf_counter(), self.epoch * planner.samples, planner.epochs * planner.samples
@@ -291,19 +292,20 @@ def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisN
     return network.eval()
 
 
-def label_settings(config: TrainConfig) -> LabelSettings:
-    """How a configuration's samples are labelled."""
-    planner, option = config.planner, config.option
-    return LabelSettings(
-        worlds=planner.worlds,
-        radius=planner.planning_radius_m or get_robot(config.robot).radius,
-        soft_margin=planner.soft_margin_m,
-        waypoints=option.waypoints,
-        spacing=option.spacing_m,
-        samples_per_world=planner.samples_per_world,
-        random_smoothing=planner.preset == "paper",
-        channels=network_class(planner.preset).channels,
-    )
+def _settings_of(folder: str, ours: LabelSettings) -> LabelSettings:
+    """Label settings of a data set.
+
+    Raises:
+        DatasetError: its labels are not those that this run's network has to learn.
+    """
+    theirs = read_manifest(folder).settings
+    for name in ("radius", "soft_margin", "waypoints", "spacing", "random_smoothing", "channels"):
+        if getattr(theirs, name) != getattr(ours, name):
+            raise DatasetError(
+                f"planner.data = {folder!r} was made with {name} = {getattr(theirs, name)!r}, "
+                f"this run plans with {getattr(ours, name)!r}: make another one with `hiernav dataset`"
+            )
+    return theirs
 
 
 def reflect(image: torch.Tensor, label: torch.Tensor, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,6 +15,8 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 from hiernav.nav import goselo  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
+from hiernav.planner.dataset import data_seed  # noqa: E402
+from hiernav.planner.store import DatasetError, write_dataset  # noqa: E402
 from hiernav.planner.train import LossWeights, PlannerTrainer, clearance_at, load_network, plan_loss, reflect  # noqa: E402
 from hiernav.run import Run, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
@@ -241,3 +243,19 @@ def test_reflection_keeps_label_and_clearance_together_and_leaves_other_rows_alo
         assert torch.equal(mine[~which], theirs[~which]) and not torch.equal(mine[which], theirs[which])
     again = reflect(*turned, which)
     assert all(torch.equal(mine, theirs) for mine, theirs in zip((image, label), again, strict=True))
+
+
+def test_training_on_a_data_set_from_disk_is_training_on_samples_of_the_run_s_own(tmp_path):
+    own = trainer_in(tmp_path / "own")
+    own.train()
+    write_dataset(tmp_path / "data", own.labels, 60, data_seed(own.config))
+    from_disk = trainer_in(tmp_path / "disk", f"planner.data={tmp_path / 'data'}")
+    from_disk.train()
+    weights, again = own.network.state_dict(), from_disk.network.state_dict()
+    assert all(torch.equal(weights[key], again[key]) for key in weights)
+
+
+def test_a_data_set_for_another_robot_or_network_is_refused(tmp_path):
+    write_dataset(tmp_path / "data", replace(trainer_in(tmp_path / "run").labels, radius=0.2), 12, (0,))
+    with pytest.raises(DatasetError, match=r"made with radius = 0.2, this run plans with 0.1"):
+        trainer_in(tmp_path / "other", f"planner.data={tmp_path / 'data'}")

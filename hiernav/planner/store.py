@@ -1,0 +1,202 @@
+"""Data sets on disk: made shard by shard in several processes, resumable, and checked whenever they are read.
+
+    dataset.json     format version, label settings, seed, number of samples; name, samples and SHA-256 of every shard
+    shard-00000.npz  `image` (S, C, 64, 64) uint8, `distance` (S,) float32, `label` (S, K, 2) float32, as `Samples`
+
+Shard k holds the samples from k * (samples per shard) on of the seed's endless sequence, the one that `make_samples`
+draws from: a data set can be made larger, and training on it is training on samples made for the run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from hiernav.planner.dataset import LabelSettings, Samples, label_worlds, map_tasks
+
+FORMAT_VERSION = 1
+MANIFEST = "dataset.json"
+_SHARD_SAMPLES = 2000
+_COMPRESSION = 1  # of zlib: higher levels save a tenth and take five times as long
+
+
+class DatasetError(ValueError):
+    """A data set that cannot be used; the message names the folder or file and what does not fit."""
+
+
+class Shard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One file of samples."""
+
+    file: str
+    samples: int
+    sha256: str
+
+
+class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a data set is, and how far it has been made."""
+
+    format_version: int
+    settings: LabelSettings
+    seed: tuple[int, ...]
+    samples: int
+    """Wanted; all there once the shards' add up to it."""
+    shards: tuple[Shard, ...]
+
+    @property
+    def finished(self) -> bool:
+        return sum(shard.samples for shard in self.shards) == self.samples
+
+
+def write_dataset(
+    folder: str | Path,
+    settings: LabelSettings,
+    count: int,
+    seed: tuple[int, ...],
+    processes: int = 1,
+    on_progress: Callable[[int], None] | None = None,
+) -> Manifest:
+    """Make a data set, or what is missing of it; a killed process loses the shards it was at.
+
+    Args:
+        on_progress: told the number of samples that are there.
+
+    Raises:
+        DatasetError: the folder holds a data set of another kind, or a damaged one.
+        OSError: it cannot be written to.
+    """
+    folder = Path(folder)
+    manifest = Manifest(FORMAT_VERSION, settings, seed, count, ())
+    if (folder / MANIFEST).exists():
+        manifest = msgspec.structs.replace(_compatible(folder, read_manifest(folder), manifest), samples=count)
+    elif folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise DatasetError(f"{folder} is not a data set and not empty: choose another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    worlds = -(-_SHARD_SAMPLES // settings.samples_per_world)
+    size = worlds * settings.samples_per_world
+    wanted = [min(size, count - first) for first in range(0, count, size)]
+    # from the first shard on that is missing or shorter than it should be now
+    kept = 0
+    while kept < min(len(wanted), len(manifest.shards)) and manifest.shards[kept].samples == wanted[kept]:
+        kept += 1
+    shards = list(manifest.shards[:kept])
+    tasks = [(folder, settings, seed, number, worlds, wanted[number]) for number in range(kept, len(wanted))]
+    done = sum(shard.samples for shard in shards)
+    if on_progress is not None:
+        on_progress(done)
+    for shard in map_tasks(_make_shard, tasks, processes):
+        shards.append(shard)
+        done += shard.samples
+        manifest = msgspec.structs.replace(manifest, shards=tuple(shards))
+        _write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+        if on_progress is not None:
+            on_progress(done)
+    return msgspec.structs.replace(manifest, shards=tuple(shards))
+
+
+def read_manifest(folder: str | Path) -> Manifest:
+    """What the data set in a folder says about itself.
+
+    Raises:
+        DatasetError: there is none, or it cannot be read.
+    """
+    file = Path(folder) / MANIFEST
+    try:
+        manifest = msgspec.json.decode(file.read_bytes(), type=Manifest)
+    except OSError as error:
+        raise DatasetError(
+            f"{folder} is no data set ({MANIFEST}: {error.strerror}); `hiernav dataset` makes one"
+        ) from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: {error}") from None
+    if manifest.format_version != FORMAT_VERSION:
+        raise DatasetError(f"{file}: format_version {manifest.format_version}, this hiernav reads {FORMAT_VERSION}")
+    return manifest
+
+
+def read_dataset(
+    folder: str | Path, count: int | None = None, on_progress: Callable[[int], None] | None = None
+) -> Samples:
+    """The first `count` samples of a data set (all by default), every shard checked.
+
+    Raises:
+        DatasetError: it has fewer samples, is unfinished, or a shard is missing, altered or of other shapes.
+    """
+    manifest = read_manifest(folder)
+    there = sum(shard.samples for shard in manifest.shards)
+    count = manifest.samples if count is None else count
+    if count > there:
+        raise DatasetError(f"{folder} has {there:,} samples, {count:,} are wanted: let `hiernav dataset` go on with it")
+    samples, done = Samples.empty(manifest.settings, count), 0
+    for shard in manifest.shards:
+        if done == count:
+            break
+        done += samples.store(done, _read_shard(Path(folder) / shard.file, shard, manifest.settings))
+        if on_progress is not None:
+            on_progress(done)
+    return samples
+
+
+def _compatible(folder: Path, there: Manifest, wanted: Manifest) -> Manifest:
+    ours, theirs = (dataclasses.asdict(m.settings) | {"seed": m.seed} for m in (wanted, there))
+    for name, value in ours.items():
+        if value != theirs[name]:
+            raise DatasetError(
+                f"{folder} holds samples with {name} = {theirs[name]!r}, not {value!r}: choose another folder"
+            )
+    return there
+
+
+def _make_shard(
+    folder: Path, settings: LabelSettings, seed: tuple[int, ...], number: int, worlds: int, count: int
+) -> Shard:
+    needed = -(-count // settings.samples_per_world)
+    samples = label_worlds(settings, seed, number * worlds, needed)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION) as archive:
+        for name in Samples.__dataclass_fields__:
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, getattr(samples, name)[:count], allow_pickle=False)
+    file = f"shard-{number:05d}.npz"
+    _write(folder / file, buffer.getvalue())
+    return Shard(file, count, hashlib.sha256(buffer.getbuffer()).hexdigest())
+
+
+def _read_shard(file: Path, shard: Shard, settings: LabelSettings) -> Samples:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{file} cannot be read ({error.strerror}): make the data set anew") from None
+    if hashlib.sha256(data).hexdigest() != shard.sha256:
+        raise DatasetError(f"{file}: SHA-256 differs from {MANIFEST}; the file is truncated or altered")
+    expected = Samples.empty(settings, 0)
+    parts = {}
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            for name in Samples.__dataclass_fields__:
+                parts[name] = arrays[name]
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{file}: {error}") from None
+    for name, values in parts.items():
+        like = getattr(expected, name)
+        if values.shape != (shard.samples, *like.shape[1:]) or values.dtype != like.dtype:
+            raise DatasetError(
+                f"{file}: {name} is {values.dtype} {values.shape}, "
+                f"expected {like.dtype} {(shard.samples, *like.shape[1:])}"
+            )
+        if values.dtype != np.uint8 and not np.isfinite(values).all():
+            raise DatasetError(f"{file}: {name} is not finite everywhere")
+    return Samples(**parts)
+
+
+def _write(path: Path, data: bytes) -> None:
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_bytes(data)
+    os.replace(temporary, path)
