@@ -45,7 +45,9 @@ class Replay:
             self._data = example.expand(size).memmap_like(folder)
             _reserve(folder)
         self._storage = TensorStorage(self._data)
-        self._buffer = ReplayBuffer(storage=self._storage, batch_size=batch_size)
+        self._buffer = ReplayBuffer(storage=self._storage)
+        self._batch_size = batch_size
+        self._columns = {key: self._data[key].as_subclass(torch.Tensor) for key in KEYS}
         self._set(0, 0)
 
     def __len__(self) -> int:
@@ -56,8 +58,14 @@ class Replay:
         self._buffer.extend(transitions.select(*KEYS))
 
     def sample(self) -> TensorDict:
-        """A random batch (B,)."""
-        return self._buffer.sample()
+        """A random batch (B,).
+
+        Drawn here from the columns: the buffer's own way takes four times as long, and it would be run at every update.
+        """
+        rows = torch.randint(len(self), (self._batch_size,))
+        drawn = {key: column.index_select(0, rows) for key, column in self._columns.items()}
+        following = {key[1]: drawn.pop(key) for key in KEYS if isinstance(key, tuple)}
+        return TensorDict({**drawn, "next": TensorDict(following, [len(rows)])}, [len(rows)])
 
     def state_dict(self) -> dict[str, int]:
         return {"cursor": int(self._buffer.writer.state_dict()["_cursor"]), "length": len(self)}
@@ -90,9 +98,12 @@ def _reserve(folder: Path) -> None:
 
 def mirror_half(batch: TensorDict, mirror: Mirror) -> None:
     """Reflect the first half of a batch (B,) of transitions left to right, in place."""
-    rows = slice(0, len(batch) // 2)
-    order, sign = torch.from_numpy(mirror.observation_index), torch.from_numpy(mirror.observation_sign)
-    for holder in (batch, batch["next"]):
-        holder["observation"][rows] = holder["observation"][rows][:, order] * sign
-    order, sign = torch.from_numpy(mirror.action_index), torch.from_numpy(mirror.action_sign)
-    batch["action"][rows] = batch["action"][rows][:, order] * sign
+    half = len(batch) // 2
+    observation = torch.from_numpy(mirror.observation_index), torch.from_numpy(mirror.observation_sign)
+    action = torch.from_numpy(mirror.action_index), torch.from_numpy(mirror.action_sign)
+    for values, (order, sign) in (
+        (batch["observation"], observation),
+        (batch["next", "observation"], observation),
+        (batch["action"], action),
+    ):
+        values[:half] = values[:half].index_select(1, order).mul_(sign)
