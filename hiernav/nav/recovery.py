@@ -1,7 +1,8 @@
 """Getting away from where the skill stands still: the same bounded manoeuvre in evaluation and on the robot.
 
 A skill without memory can settle in a posture that its own mean action holds for ever, or push at an obstacle. What
-led there is undone for a moment: the action is reversed, and the skill starts again from another posture.
+led there is undone for a moment: the action is reversed and shaken, by a pattern that differs from one try to the
+next, and the skill starts again from another posture.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import numpy as np
 
 
 class Recovery:
-    """Reverses the actions of robots that should move and do not.
+    """Reverses and shakes the actions of robots that should move and do not.
 
     A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away. Its
-    actions are then negated for `duration_s`, or until it is `reach_m` away. After `limit` recoveries without coming
-    `clear_m` away from where the first of them began, it is given up and its actions are left alone.
+    actions are then negated for `duration_s`, or until it is `reach_m` away, plus a dither of `shake` in standard
+    deviation that depends on the number of the recovery alone, so that a drive can be repeated to the bit. After
+    `limit` recoveries without coming `clear_m` away from where the first of them began, it is given up and its actions
+    are left alone.
 
     Attributes:
         counts: (N,) int, recoveries since the reset.
@@ -28,12 +31,14 @@ class Recovery:
         control_period: float,
         window_s: float = 1.5,
         least_m: float = 0.05,
-        duration_s: float = 0.4,
+        duration_s: float = 0.6,
+        shake: float = 0.5,
         reach_m: float = 0.5,
         limit: int = 3,
         clear_m: float = 0.5,
     ) -> None:
         self.least_m, self.reach_m, self.limit, self.clear_m = least_m, reach_m, limit, clear_m
+        self.shake = shake
         self._duration = max(1, round(duration_s / control_period))
         self._trail = np.full((max(1, round(window_s / control_period)), num_rows, 2), np.nan)
         self._tick = 0
@@ -93,5 +98,14 @@ class Recovery:
         self.counts += begins
         self._left[np.linalg.norm(position - self._began, axis=-1) > self.reach_m] = 0
         self.active = self._left > 0
+        shaken = action.copy()
+        for row in np.flatnonzero(self.active).tolist():
+            dither = _dither(int(self.counts[row]), int(self._left[row]), action.shape[1])
+            shaken[row] = np.clip(self.shake * dither - action[row], -1.0, 1.0)
         self._left -= self.active
-        return np.where(self.active[:, None], -action, action)
+        return shaken
+
+
+def _dither(number: int, tick: int, size: int) -> np.ndarray:
+    """Standard normal values (size,) for a tick of a recovery: the same ones always."""
+    return np.random.default_rng((number, tick)).standard_normal(size)
