@@ -57,7 +57,7 @@ def make_task(
     planner: Planner | None = None,
     worlds: Sequence[WorldSpec] | None = None,
     layouts: LayoutSource | None = None,
-    end_on_fall: bool = False,
+    training: bool = False,
 ) -> NavigationTask:
     """The task of a configuration.
 
@@ -67,7 +67,7 @@ def make_task(
         planner: guides them; `default_planner` by default.
         worlds: that `layouts` may draw from; the skill's training worlds by default.
         layouts: random ones from the configuration's seed by default.
-        end_on_fall: see `NavigationTask`.
+        training: whether episodes end as `skill.end_on_fall` and `skill.episode_steps` say, or as the protocols do.
     """
     robot = get_robot(config.robot)
     worlds = [parse_world(text) for text in config.skill.worlds] if worlds is None else list(worlds)
@@ -87,7 +87,8 @@ def make_task(
         skill_layout(config),
         config.reward,
         config.threads,
-        end_on_fall,
+        training and config.skill.end_on_fall,
+        config.skill.episode_steps if training else None,
     )
 
 

@@ -68,6 +68,7 @@ class NavigationTask:
         reward: weights of its terms.
         threads: that step the physics.
         end_on_fall: whether an episode ends when the robot has turned over; a training aid, no protocol has it.
+        max_steps: a cap on an episode's steps below that of its world, likewise.
     """
 
     def __init__(
@@ -80,12 +81,14 @@ class NavigationTask:
         reward: RewardConfig | None = None,
         threads: int = 1,
         end_on_fall: bool = False,
+        max_steps: int | None = None,
     ) -> None:
         self.robot, self.layout, self.option = robot, layout, option
         self.num_rows = option.num_rows
         self.reward = reward or RewardConfig()
         self.sim = BatchSim(robot, self.num_rows, scene_for(worlds), threads)
         self.end_on_fall = end_on_fall
+        self._cap = np.iinfo(np.int64).max if max_steps is None else max_steps
         self._draw = layouts
         self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
         self._maps: list[OccupancyMap] = [None] * self.num_rows  # type: ignore[list-item]
@@ -120,7 +123,7 @@ class NavigationTask:
             self.layouts[row] = layout
             self._maps[row] = layout.occupancy(0.0)
             self.goal[row] = layout.goal
-            self._max_steps[row] = layout.spec.max_steps
+            self._max_steps[row] = min(layout.spec.max_steps, self._cap)
             self._moving[row] = len(layout.gremlins) > 0
             self._set_points(row, layout.obstacle_points(0.0))
         self.steps[rows] = 0

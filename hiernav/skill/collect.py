@@ -53,7 +53,7 @@ class LocalBatches:
         self.config, self.policy = config, policy
         skill = config.skill
         self.frames = frames_of_batch(skill.num_envs, skill.total_steps)
-        self.task = make_task(config, skill.num_envs, planner, end_on_fall=skill.end_on_fall)
+        self.task = make_task(config, skill.num_envs, planner, training=True)
         self._env = NavigationEnv(self.task)
 
     def segment(self, steps: int, frames: int) -> Generator[TensorDict]:

@@ -173,7 +173,7 @@ class Cluster:
 def make_env(config: TrainConfig, planner: Planner | None = None) -> NavigationEnv:
     """The simulations of one worker, made where it runs."""
     torch.set_num_threads(config.threads)
-    return NavigationEnv(make_task(config, config.skill.num_envs, planner, end_on_fall=config.skill.end_on_fall))
+    return NavigationEnv(make_task(config, config.skill.num_envs, planner, training=True))
 
 
 def make_acting_policy(config: TrainConfig) -> TensorDictModuleBase:

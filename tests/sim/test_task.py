@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from small_tasks import WORLD, Silent, facing_goal, still, task_of, teleport
+from small_tasks import WORLD, Silent, Straight, facing_goal, still, task_of, teleport
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.nav.frames import body_to_world
@@ -193,3 +193,12 @@ def test_gremlins_move_in_the_map_and_in_the_lidar() -> None:
     position = 0.3 * np.array([np.cos(task.sim.time[0]), np.sin(task.sim.time[0])])
     assert task._maps[0].occupied_at(position)
     assert not np.allclose(step.observation[0, task.layout.slices["lidar"]], lidar)
+
+
+def test_training_may_cut_episodes_short_and_evaluation_does_not() -> None:
+    config = load_config(None, ["skill.episode_steps=2"])
+    for training, truncated in ((True, True), (False, False)):
+        task = make_task(config, 1, Straight(), [WORLD], training=training)
+        task.reset(layouts=[facing_goal()])
+        assert not still(task).truncated[0]
+        assert still(task).truncated[0] == truncated
