@@ -121,6 +121,9 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     discount: Annotated[float, Meta(ge=0, lt=1, description="Discount per control step.")] = 0.98
     tau: Annotated[float, Meta(gt=0, le=1, description="Rate at which target critics follow.")] = 0.005
     learning_rate: Annotated[float, Meta(gt=0, le=1, description="Step size of the optimisers.")] = 3e-4
+    actor_average: Annotated[
+        int, Meta(ge=0, description="Updates that the evaluated and exported actor is averaged over; 0: the last one.")
+    ] = 1_000
     alpha_floor: Annotated[float, Meta(ge=0, description="The temperature does not fall below this.")] = 0.005
     alpha_floor_end: Annotated[
         Annotated[float, Meta(ge=0)] | None,
@@ -140,6 +143,10 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ] = None
     mirror: Annotated[bool, Meta(description="Reflect half of every batch left to right.")] = True
     end_on_fall: Annotated[bool, Meta(description="End a training episode when the robot has turned over.")] = True
+    episode_steps: Annotated[
+        Annotated[int, Meta(ge=1)] | None,
+        Meta(description="Cap on the steps of a training episode; null: that of its world."),
+    ] = None
     greedy_share: Annotated[
         float, Meta(ge=0, le=1, description="Share of simulations that act without noise, as the exported skill does.")
     ] = 0.0
@@ -230,6 +237,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "discount": 0.99,
             "init_alpha": 1.0,
             "alpha_floor": 0.0,
+            "actor_average": 0,
             "mirror": False,
             "end_on_fall": False,
         },

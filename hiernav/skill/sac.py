@@ -35,6 +35,8 @@ class SacSettings:
     """The temperature is kept at or above this."""
     target_entropy: float | None = None
     """None: minus the number of actions."""
+    actor_average: int = 0
+    """Updates that the exported actor is averaged over (Polyak and Juditsky 1992); 0: it is the last one."""
     layer_norm: bool = False
     """Layer normalisation in the critics (beyond the paper)."""
     precision: str = "float32"
@@ -77,7 +79,8 @@ class Learner:
     """Actor, twin critics, temperature and their optimiser.
 
     The three losses touch disjoint parameters, so one backward pass and one optimiser step serve all. `actor` and
-    `policy` act on the processor, beside the simulations; what learns on a GPU is a copy of them, see `publish`.
+    `policy` act on the processor, beside the simulations, and `average` is the actor to export; what learns on a GPU is
+    a copy of them, see `publish`.
 
     Args:
         layout: of the observation.
@@ -96,9 +99,11 @@ class Learner:
         self.settings, self.device = settings, torch.device(device)
         self.actor = self._learning = Actor(layout, action_dim, settings.hidden, layer_norm=False)
         self.policy = learning = make_policy(self.actor, action_dim)
+        self.average = self._averaging = copy.deepcopy(self.actor) if settings.actor_average else self.actor
         critic = Critic(layout, action_dim, settings.hidden, settings.layer_norm)
         if self.device.type != "cpu":
             self._learning = copy.deepcopy(self.actor).to(self.device)
+            self._averaging = copy.deepcopy(self.average).to(self.device) if settings.actor_average else self._learning
             learning = make_policy(self._learning, action_dim)
         self.loss = DirectSACLoss(
             learning,
@@ -112,6 +117,8 @@ class Learner:
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
         self.optimizer = torch.optim.Adam([self.loss.weights], settings.learning_rate, fused=True)
+        self._actor_weights = list(self._learning.parameters())
+        self._mean_weights = list(self._averaging.parameters())
         self.updates = 0
 
     def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
@@ -122,6 +129,11 @@ class Learner:
         self.optimizer.step()
         self.loss.move_targets(self.settings.tau)
         self.updates += 1
+        if self._averaging is not self._learning:
+            # the mean of all actors at first, so that the untrained one leaves no trace
+            weight = 1.0 / min(self.updates, self.settings.actor_average)
+            with torch.no_grad():
+                torch._foreach_lerp_(self._mean_weights, self._actor_weights, weight)
         return metrics
 
     @property
@@ -130,9 +142,10 @@ class Learner:
         return bool(self.loss.weights.isfinite().all())
 
     def publish(self) -> None:
-        """Let the acting policy have the weights learnt so far; where it is the one that learns, it has them."""
-        if self._learning is not self.actor:
-            self.actor.load_state_dict(self._learning.state_dict())
+        """Let `policy` and `average` have the weights learnt so far; where they are what learns, they have them."""
+        for shown, learning in ((self.actor, self._learning), (self.average, self._averaging)):
+            if learning is not shown:
+                shown.load_state_dict(learning.state_dict())
 
     def set_alpha_floor(self, floor: float) -> None:
         """Keep the temperature at or above `floor`; 0 lets it fall freely."""
@@ -140,10 +153,16 @@ class Learner:
 
     def state_dict(self) -> dict:
         """Everything a resumed run needs of the learner."""
-        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict(), "updates": self.updates}
+        return {
+            "loss": self.loss.state_dict(),
+            "average": self._averaging.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
 
     def load_state_dict(self, state: dict) -> None:
         self.loss.load_state_dict(state["loss"])
+        self._averaging.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.updates = state["updates"]
         self.publish()

@@ -80,6 +80,7 @@ def make_learner(config: TrainConfig) -> Learner:
         init_alpha=skill.init_alpha,
         alpha_floor=skill.alpha_floor,
         target_entropy=skill.target_entropy,
+        actor_average=skill.actor_average,
         layer_norm=skill.layer_norm,
         precision=skill.precision,
     )
@@ -188,10 +189,10 @@ class SkillTrainer:
                 for data in batches:
                     data["next", "reward"] *= skill.reward_scale
                     self._episodes.add(data)
-                    window.append(data.select(*_LOGGED))
-                    self.replay.extend(data)
-                    self.steps += len(data)
-                    metrics = self._update(len(data))
+                    window.append(data.select(*_LOGGED).reshape(-1))
+                    self.replay.extend(data.reshape(-1))
+                    self.steps += data.numel()
+                    metrics = self._update(data.numel())
                     if on_progress is not None:
                         on_progress(self._progress((self.steps - first) / (time.perf_counter() - began)))
         except PhysicsDiverged as error:
@@ -265,14 +266,14 @@ class SkillTrainer:
         return (done // every + 1) * every
 
     def _evaluate(self) -> None:
-        """Reach rate of the deterministic policy on worlds that are never trained on; keeps the best actor."""
+        """Reach rate of the averaged, noiseless policy on worlds that are never trained on; keeps the best actor."""
         skill = self.config.skill
         radius = self._robot.radius
         seeds = np.random.SeedSequence((self.config.seed, _EVALUATION_SEED)).generate_state(skill.eval_episodes)
         worlds = [parse_world(text) for text in skill.worlds]
         layouts = [sample_layout(worlds[i % len(worlds)], int(seed), radius) for i, seed in enumerate(seeds)]
         task = make_task(self.config, min(64, skill.eval_episodes), self.planner)
-        episodes = run_episodes(task, TorchSkill(self.learner.actor), layouts)
+        episodes = run_episodes(task, TorchSkill(self.learner.average), layouts)
         result = {
             "step": self.steps,
             "reach_rate": float(np.mean([e.reached for e in episodes])),
@@ -282,7 +283,7 @@ class SkillTrainer:
         }
 
         if all(merit(result) >= merit(earlier) for earlier in self.evaluations):
-            self.best_actor = {key: value.clone() for key, value in self.learner.actor.state_dict().items()}
+            self.best_actor = {key: value.clone() for key, value in self.learner.average.state_dict().items()}
         self.evaluations.append(result)
         self.run.log("evaluation", self.steps, {k: v for k, v in result.items() if k != "step"})
 

@@ -10,6 +10,7 @@ pytest.importorskip("torchrl")
 
 from tensordict import TensorDict  # noqa: E402
 from torch import nn  # noqa: E402
+from torch.testing import assert_close  # noqa: E402
 from torchrl.objectives import SACLoss  # noqa: E402
 
 from hiernav.config import load_config  # noqa: E402
@@ -311,3 +312,23 @@ def test_the_temperature_is_lifted_to_its_floor() -> None:
     learner = make_learner(load_config())
     learner.set_alpha_floor(3.0)
     assert float(learner.loss._alpha) == pytest.approx(3.0)
+
+
+def test_the_exported_actor_is_the_mean_of_the_last_ones() -> None:
+    one = learner(SacSettings(hidden=(16, 16), actor_average=4))
+    assert one.average is not one.actor
+    seen = []
+    for seed in range(3):
+        one.update(batch(seed))
+        seen.append(one.actor.head.weight.detach().clone())
+    one.publish()
+    assert_close(one.average.head.weight, sum(seen) / 3)
+    assert not torch.equal(seen[0], seen[1]), "the actors differ"
+    other = learner(SacSettings(hidden=(16, 16), actor_average=4), seed=1)
+    other.load_state_dict(one.state_dict())
+    assert_close(other.average.head.weight, one.average.head.weight)
+
+
+def test_without_averaging_the_last_actor_is_exported() -> None:
+    one = learner()
+    assert one.average is one.actor
