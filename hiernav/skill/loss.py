@@ -38,7 +38,7 @@ class DirectSACLoss(SACLoss):
     The temporal-difference target is that of TD(0): bootstrap through truncation, not through termination.
 
     Args:
-        precision: of the products in hidden layers. Weights, heads, distributions and losses stay in float32.
+        precision: of the products. Weights, outputs, distributions and losses stay in float32.
     """
 
     def __init__(self, *args: Any, precision: torch.dtype = torch.float32, **kwargs: Any) -> None:

@@ -36,7 +36,7 @@ class Perceptrons:
             The parameters are moved: from here on they are views of `weights`.
         weights: float32 memory for them, `count(tree)` long.
         gradients: as much for their gradients; None for networks that do not learn.
-        precision: of the products in hidden layers. Weights, gradients and the head are in float32.
+        precision: of the products. Weights and gradients are kept, and outputs computed, in float32.
     """
 
     def __init__(
@@ -51,15 +51,13 @@ class Perceptrons:
         for layer, places in zip(tensors, _cut(weights, shapes), strict=True):
             for tensor, place in zip(layer, places, strict=True):
                 tensor.data = place.copy_(tensor.data)
-        hidden = len(weights) - sum(tensor.numel() for tensor in tensors[-1])
-        self._master, self._weights = weights[:hidden], weights[:hidden].to(precision)
-        *_, self._head = _layers(weights, shapes)
-        self._hidden = _layers(self._weights, shapes[:-1])
+        self._master, self._weights = weights, weights.to(precision)
+        self._layers = _layers(self._weights, shapes)
+        self._head = _layers(weights, shapes)[-1]
         self.copies = len(self._head.weight)
         if gradients is not None:
-            self._master_gradients, self._gradients = gradients[:hidden], gradients[:hidden].to(precision)
-            *_, self._head_gradient = _layers(gradients, shapes)
-            self._hidden_gradients = _layers(self._gradients, shapes[:-1])
+            self._master_gradients, self._gradients = gradients, gradients.to(precision)
+            self._layer_gradients = _layers(self._gradients, shapes)
         self._precision = precision
         self._kept: list[torch.Tensor] = []
         self._statistics: dict[int, list[tuple[torch.Tensor, torch.Tensor]]] = {}
@@ -74,54 +72,48 @@ class Perceptrons:
         """Outputs (K, B, O) of all networks for the same inputs (B, I)."""
         value = self._cast("inputs", inputs, self._precision).expand(self.copies, -1, -1)
         self._kept = [value]
-        for k, layer in enumerate(self._hidden):
+        for k, layer in enumerate(self._layers[:-1]):
             room = self._room("hidden", k, (*value.shape[:2], layer.bias.shape[-1]), self._precision)
             value = torch.baddbmm(layer.bias, value, layer.weight.mT, out=room)
             if layer.norm:
                 value = self._normalise(k, value)
             self._kept.append(value.relu_())
-        self._last = self._cast("last", value, torch.float32)
-        return torch.baddbmm(self._head.bias, self._last, self._head.weight.mT)
+        return torch.baddbmm(self._head.bias, self._cast("last", value, torch.float32), self._head.weight.mT)
 
     def backward(self, by_outputs: torch.Tensor) -> None:
         """Write the gradients of a loss into `gradients`, given its derivative (K, R, O) by the first R outputs."""
-        rows = by_outputs.shape[1]
-        torch.bmm(by_outputs.mT, self._last[:, :rows], out=self._head_gradient.weight)
-        torch.sum(by_outputs, 1, keepdim=True, out=self._head_gradient.bias)
         for k, slope in self._slopes(by_outputs, learning=True):
-            torch.bmm(slope.mT, self._kept[k][:, :rows], out=self._hidden_gradients[k].weight)
-            torch.sum(slope, 1, keepdim=True, out=self._hidden_gradients[k].bias)
+            torch.bmm(slope.mT, self._kept[k][:, : slope.shape[1]], out=self._layer_gradients[k].weight)
+            torch.sum(slope, 1, keepdim=True, out=self._layer_gradients[k].bias)
         if self._gradients is not self._master_gradients:
             self._master_gradients.copy_(self._gradients)
 
     def backward_to_inputs(self, by_outputs: torch.Tensor, columns: slice) -> torch.Tensor:
         """The derivative (R, C) of a loss by some columns of the inputs, summed over the networks."""
         *_, (_, slope) = self._slopes(by_outputs, learning=False)
-        return torch.bmm(slope, self._hidden[0].weight[:, :, columns]).sum(0, dtype=torch.float32)
+        return torch.bmm(slope, self._layers[0].weight[:, :, columns]).sum(0, dtype=torch.float32)
 
     def _slopes(self, by_outputs: torch.Tensor, learning: bool) -> Iterator[tuple[int, torch.Tensor]]:
-        """Derivatives (K, R, out) by the linear layers' results, from the last hidden layer to the first."""
-        rows = by_outputs.shape[1]
-        last = self._room("slope of last", 0, (self.copies, rows, self._last.shape[-1]), torch.float32)
-        # with one output, the product is one of a column and a row
-        (torch.mul if by_outputs.shape[-1] == 1 else torch.bmm)(by_outputs, self._head.weight, out=last)
-        slope = self._cast("slope", last, self._precision)
-        for k in reversed(range(len(self._hidden))):
+        """Derivatives (K, R, out) by the results of the linear layers, from the head to the first."""
+        slope = self._cast("slope", by_outputs, self._precision)
+        yield len(self._layers) - 1, slope
+        for k in reversed(range(len(self._layers) - 1)):
+            weight = self._layers[k + 1].weight
+            room = self._room("slope", k, (*slope.shape[:2], weight.shape[-1]), self._precision)
+            # behind a single output, the product is one of a column and a row
+            (torch.mul if weight.shape[1] == 1 else torch.bmm)(slope, weight, out=room)
             # where the layer was silent nothing comes through
-            torch.ops.aten.threshold_backward.grad_input(slope, self._kept[k + 1][:, :rows], 0, grad_input=slope)
-            if self._hidden[k].norm:
+            kept = self._kept[k + 1][:, : slope.shape[1]]
+            slope = torch.ops.aten.threshold_backward.grad_input(room, kept, 0, grad_input=room)
+            if self._layers[k].norm:
                 self._denormalise(k, slope, learning)
             yield k, slope
-            if k:
-                weight = self._hidden[k].weight
-                room = self._room("slope", k, (*slope.shape[:2], weight.shape[-1]), self._precision)
-                slope = torch.bmm(slope, weight, out=room)
 
     def _normalise(self, k: int, value: torch.Tensor) -> torch.Tensor:
         """Layer norm (K, B, out) of hidden layer k."""
         normed, size = self._room("normed", k, value.shape, self._precision), value.shape[-1:]
         self._statistics[k] = []
-        for n, (gain, shift) in enumerate(zip(*self._hidden[k].norm, strict=True)):
+        for n, (gain, shift) in enumerate(zip(*self._layers[k].norm, strict=True)):
             result, mean, rstd = torch.native_layer_norm(value[n], size, gain, shift, _NORM_EPSILON)
             normed[n].copy_(result)
             self._statistics[k].append((mean, rstd))
@@ -132,14 +124,14 @@ class Perceptrons:
         rows, size = slope.shape[1], slope.shape[-1:]
         value = self._rooms["hidden", k]
         for n, ((gain, shift), (mean, rstd)) in enumerate(
-            zip(zip(*self._hidden[k].norm, strict=True), self._statistics[k], strict=True)
+            zip(zip(*self._layers[k].norm, strict=True), self._statistics[k], strict=True)
         ):
             inputs, *weights = torch.ops.aten.native_layer_norm_backward(
                 slope[n], value[n, :rows], size, mean[:rows], rstd[:rows], gain, shift, [True, learning, learning]
             )
             slope[n].copy_(inputs)
             if learning:
-                for place, gradient in zip(self._hidden_gradients[k].norm, weights, strict=True):
+                for place, gradient in zip(self._layer_gradients[k].norm, weights, strict=True):
                     place[n].copy_(gradient)
 
     def _cast(self, name: str, values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
