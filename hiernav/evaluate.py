@@ -168,9 +168,7 @@ def wilson_interval(successes: int, trials: int, z: float = _Z95) -> tuple[float
 
 
 def _plan_counts(planner: Planner) -> dict[str, int]:
-    if isinstance(planner, VerifiedPlanner):
-        return {name: getattr(planner, name) for name in ("proposals", "repairs", "loops", "refusals")}
-    return {}
+    return planner.counts() if isinstance(planner, VerifiedPlanner) else {}
 
 
 def _from_bundle(path: Path) -> Policies:

@@ -9,8 +9,11 @@ import torch
 from rich.progress import Progress, TaskID
 
 from hiernav.nav.option import Planner
+from hiernav.nav.planners import VerifiedPlanner
 from hiernav.planner import train as planner_train
 from hiernav.run import Run
+from hiernav.sim.factory import expert_planner
+from hiernav.sim.robots import get_robot
 from hiernav.skill import train as skill_train
 
 _LINE_SECONDS = 30.0
@@ -37,11 +40,13 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         planner.train(_PlannerDisplay(progress))
         run.summarize({"planner": {**planner.validation, "seconds": round(time.perf_counter() - began, 1)}})
     if stage in ("skill", "all"):
-        guide = None
+        guide: Planner | None = None
         if run.config.skill.planner == "cnn":
             if not planner.finished:
                 raise ValueError("skill.planner = cnn needs a trained planner: run the planner stage first")
             guide = planner_train.torch_planner(planner.network.cpu(), planner.labels)
+            if run.config.skill.preset != "paper":
+                guide = VerifiedPlanner(guide, expert_planner(run.config), get_robot(run.config.robot).radius)
         _train_skill(run, guide, progress)
 
 

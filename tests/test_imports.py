@@ -24,7 +24,7 @@ ALLOWED = {
     "run": {"config"},
     "planner": {"nav", "sim", "config", "run", "device"},
     "skill": {"nav", "sim", "config", "run", "device"},
-    "training": {"nav", "planner", "skill", "run"},
+    "training": {"nav", "sim", "planner", "skill", "run"},
     "runtime": {"nav", "decode", "__init__"},
     "evaluate": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hiernav.nav import goselo
-from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import divide, polyline
 from hiernav.nav.search import PathField
@@ -44,12 +44,16 @@ class ShortestPathPlanner:
         for row, (position, goal, occupancy) in enumerate(
             zip(query.position, query.goal, query.occupancy, strict=True)
         ):
-            if not np.isfinite(position).all():
+            if not np.isfinite([position, goal]).all():
                 continue
             waypoints = self.field(occupancy, goal).waypoints(position, self.num_waypoints, self.spacing)
             if waypoints is not None:
                 plans[row] = waypoints
         return plans
+
+    def refusal(self, query: PlanQuery, row: int) -> str | None:
+        """Why a row of a query has no plan: one of `hiernav.nav.search.REFUSALS`; None if it has one."""
+        return self.field(query.occupancy[row], query.goal[row]).refusal(query.position[row])
 
     def field(self, occupancy: OccupancyMap, goal: np.ndarray) -> PathField:
         """The shortest-path field of a map and a goal (2,) [m]."""
@@ -88,7 +92,7 @@ class GoseloPlanner:
     """Clearance a hypothesis must keep where any does [m]."""
     margin: float = 0.15
     """Further clearance worth a lower score: what a robot that strays from its plan needs [m]."""
-    hysteresis: float = 0.5
+    hysteresis: float = 1.0
     """Score a hypothesis gains by lying on the plan it replaces; keeps plans from flipping sides."""
 
     def plan(self, query: PlanQuery) -> np.ndarray:
@@ -112,8 +116,7 @@ class GoseloPlanner:
                 for position, plans, occupancy in zip(query.position, candidates, query.occupancy, strict=True)
             ]
         )
-        apart = np.linalg.norm(candidates[:, :, -1] - query.previous[:, None, -1], axis=-1)
-        agreement = np.exp(-np.nan_to_num(apart, nan=np.inf) / 0.3)
+        agreement = np.exp(-np.nan_to_num(apart_from(query.previous, query.position, candidates), nan=np.inf) / 0.1)
         shortfall = np.clip(self.radius - clearance, 0.0, None) / self.radius
         tight = np.clip(1.0 - (clearance - self.radius) / max(self.margin, 1e-6), 0.0, 1.0)
         merit = scores + self.hysteresis * agreement - 100.0 * shortfall - _TIGHTNESS * tight**2
@@ -139,6 +142,8 @@ class VerifiedPlanner:
     repairs: int = 0
     loops: int = 0
     refusals: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Refusals by why there is no path (`hiernav.nav.search.REFUSALS`)."""
 
     def plan(self, query: PlanQuery) -> np.ndarray:
         plans = self.planner.plan(query)
@@ -150,27 +155,53 @@ class VerifiedPlanner:
             ]
         )
         free = clearance >= self.radius
-        back = free & [
-            any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])
-            for plan, visits in zip(plans, query.visits, strict=True)
-        ]
+        back = np.array([ok and self._leads_back(*row) for ok, *row in zip(free, plans, query.visits, strict=True)])
         bad = np.flatnonzero(~free | back).tolist()
-        if bad:
-            part = PlanQuery(
-                query.position[bad],
-                query.goal[bad],
-                [query.occupancy[row] for row in bad],
-                [query.visits[row] for row in bad],
-                query.previous[bad],
-            )
-            repaired = self.repair.plan(part)
-            found = np.isfinite(repaired).all(axis=(1, 2))
-            plans = plans.copy()
-            plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
-            self.repairs += int(found.sum())
-            self.loops += int((found & back[bad]).sum())
-            self.refusals += int((~found & ~free[bad]).sum())
+        if not bad:
+            return plans
+        part = PlanQuery(
+            query.position[bad],
+            query.goal[bad],
+            [query.occupancy[row] for row in bad],
+            [query.visits[row] for row in bad],
+            query.previous[bad],
+        )
+        repaired = self.repair.plan(part)
+        found = np.isfinite(repaired).all(axis=(1, 2))
+        refused = np.flatnonzero(~found & ~free[bad]).tolist()
+        plans = plans.copy()
+        plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
+        self.repairs += int(found.sum())
+        self.loops += int((found & back[bad]).sum())
+        self.refusals += len(refused)
+        self.reasons.update(self.repair.refusal(part, row) or "unknown" for row in refused)
         return plans
+
+    def counts(self) -> dict[str, int]:
+        """Proposals, repairs, loops among them, refusals and why, `refusals/...`, since the start."""
+        totals = {name: getattr(self, name) for name in ("proposals", "repairs", "loops", "refusals")}
+        return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
+
+    def _leads_back(self, plan: np.ndarray, visits: VisitMap) -> bool:
+        return any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])
+
+
+def apart_from(previous: np.ndarray, position: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """How far plans lie from what is left of the ones they would replace.
+
+    Args:
+        previous: (M, P, 2) [m], NaN where there is none.
+        position: (M, 2) of the robots [m]; what is left begins at the waypoint closest to it.
+        candidates: (M, H, K, 2) [m].
+
+    Returns:
+        (M, H) mean distance [m] of those waypoints, as far as a candidate reaches, from the candidate's nearest one.
+    """
+    index = np.arange(previous.shape[1])
+    first = np.nan_to_num(np.linalg.norm(previous - position[:, None], axis=-1), nan=np.inf).argmin(axis=1)
+    apart = np.linalg.norm(previous[:, None, :, None] - candidates[:, :, None, :], axis=-1).min(axis=-1)
+    left = (index >= first[:, None])[:, None]
+    return (apart * left).sum(axis=-1) / left.sum(axis=-1)
 
 
 def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap, spacing: float = 0.05) -> np.ndarray:

@@ -16,7 +16,17 @@ from hiernav.nav.occupancy import OccupancyMap
 
 CELL = 0.1  # [m], planning grid of the paper
 _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
+GOAL_REACH = 0.3  # [m], a goal with no room for the disc within this is blocked
 _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line
+
+
+REFUSALS = {
+    "not_finite": "the position or the goal is no number",
+    "no_room": "the robot fits nowhere on the map",
+    "goal_blocked": "the robot fits nowhere within 0.3 m of the goal",
+    "enclosed": "no way leads from the position to the goal",
+}
+"""Why there may be no path."""
 
 
 class PathField:
@@ -24,7 +34,8 @@ class PathField:
 
     Args:
         occupancy: the map.
-        goal: (2,) world frame [m]; the nearest traversable cell stands for it.
+        goal: (2,) world frame [m]; where the disc does not fit, the nearest cell where it does stands for it, unless
+            that is farther than `GOAL_REACH`.
         radius: disc that must fit everywhere on a path [m].
         soft_margin: further clearance that is worth a detour [m].
         soft_weight: relative extra cost of a metre at clearance `radius`.
@@ -46,7 +57,12 @@ class PathField:
         self._free = clearance >= radius
         self._cost, self._next = np.full(len(self._free), np.inf), np.full(len(self._free), -1)
         self.goal_cell = _nearest(self._centers, self._free, self.goal)
+        if self.goal_cell is not None and np.linalg.norm(self._centers[self.goal_cell] - self.goal) > GOAL_REACH:
+            self.goal_cell = None
+        self._end = self.goal
         if self.goal_cell is not None:
+            if not occupancy.clearance_at(self.goal) >= radius:
+                self._end = self._centers[self.goal_cell]
             graph = _grid_graph(self._free.reshape(self._shape), self._factor(clearance).reshape(self._shape))
             self._cost, self._next = dijkstra(graph, indices=self.goal_cell, return_predecessors=True)
         self._entry: np.ndarray | None = None
@@ -75,8 +91,18 @@ class PathField:
             del cells[0]  # its centre may lie behind the start
         vertices = self._centers[cells]
         if cell == self.goal_cell:
-            vertices = np.concatenate([vertices[:-1], self.goal[None]])
+            vertices = np.concatenate([vertices[:-1], self._end[None]])
         return np.concatenate([start[None], vertices])
+
+    def refusal(self, start: np.ndarray) -> str | None:
+        """Why no path leads from a start (2,) to the goal: one of `REFUSALS`; None if one does."""
+        if not np.isfinite([start, self.goal]).all():
+            return "not_finite"
+        if not self._free.any():
+            return "no_room"
+        if self.goal_cell is None:
+            return "goal_blocked"
+        return None if self.path_from(start, max_vertices=1) is not None else "enclosed"
 
     def line_cost(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Cost of straight lines: (M, 2), (M, 2) -> (M,) [m]; inf where the disc does not fit."""

@@ -483,7 +483,7 @@ class Driver:
 
     def _planner_counts(self) -> Counter[str]:
         pilot = self.pilot
-        return Counter(rejected=pilot.rejected, late=pilot.late, restarts=pilot.restarts)
+        return Counter({"rejected": pilot.rejected, "late": pilot.late, "restarts": pilot.restarts} | pilot.plan_counts)
 
     def _result(self, trip: Trip, stopped: bool) -> RunResult:
         guard, estimator, planner = self._before

@@ -137,6 +137,12 @@ class Pilot:
         return self._sound.rejected
 
     @property
+    def plan_counts(self) -> dict[str, int]:
+        """Proposals, repairs, loops and refusals of a planner in this process (`VerifiedPlanner.counts`)."""
+        counts = getattr(self._sound.planner, "counts", None)
+        return {} if counts is None else counts()
+
+    @property
     def recoveries(self) -> int:
         """Since the reset."""
         return int(self.agent.recovery.counts[0])

@@ -67,7 +67,7 @@ class RunResult:
     """How often the robot had to wait, by cause."""
     recoveries: int = 0
     planner: Mapping[str, int] = field(default_factory=dict)
-    """Of this run: plans rejected, plans too late, restarts of the planner."""
+    """Of this run: plans rejected, plans too late, restarts of the planner; proposals, repairs, refusals and why."""
 
     @property
     def reached(self) -> bool:

@@ -21,6 +21,7 @@ from hiernav.config import SkillConfig, TrainConfig
 from hiernav.device import choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner, TerminationReason
+from hiernav.nav.planners import VerifiedPlanner
 from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.layout import parse_world
@@ -118,6 +119,7 @@ class SkillTrainer:
 
     def __init__(self, config: TrainConfig, run: Run, planner: Planner | None = None) -> None:
         self.config, self.run, self.planner = config, run, planner
+        self._plans: dict[str, int] = {}
         skill = config.skill
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
         torch.manual_seed(int(seeds[0]))
@@ -258,7 +260,16 @@ class SkillTrainer:
             "updates": self.learner.updates,
             **{f"reward/{name}": value for name, value in zip(TERMS, terms, strict=True)},
             **{f"replans/{r.name.lower()}": float(reasons[r] / reasons.sum()) for r in TerminationReason if r},
+            **self._new_plans(),
         }
+
+    def _new_plans(self) -> dict[str, float]:
+        """Proposals, repairs and refusals of a network that plans in this process, since the last time."""
+        if not isinstance(self.planner, VerifiedPlanner):
+            return {}
+        before, self._plans = self._plans, self.planner.counts()
+        names = ("proposals", "repairs", "loops", "refusals")
+        return {f"plans/{name}": float(self._plans[name] - before.get(name, 0)) for name in names}
 
     def _next_evaluation(self) -> float:
         every = self.config.skill.eval_every_steps

@@ -79,6 +79,7 @@ class Scripted:
     rejected: int = 0
     late: int = 0
     restarts: int = 0
+    plan_counts: Mapping[str, int] = field(default_factory=dict)
     recoveries: int = 0
 
     def reset(self) -> None:

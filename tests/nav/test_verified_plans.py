@@ -1,0 +1,161 @@
+"""A plan that is handed out is free, or none is, for a reason; and it does not change sides without one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nav_planners import WatchedPlanner, map_with_pillars, query_of
+
+from hiernav.nav.bundle import load_bundle
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.option import PlanQuery
+from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner, apart_from
+from hiernav.nav.search import GOAL_REACH, REFUSALS, PathField
+from hiernav.runtime.policy import load_policies
+from hiernav.sim.layout import Layout, parse_world
+from hiernav.sim.walk import walk
+from hiernav.sim.worlds import sample_layout
+
+SIX_WORLDS = ("pillar(2,2,10)", "pillar(3,3,25)", "pillar(4,4,40)", "gremlin", "two-room", "four-room")
+BUNDLE = Path(__file__).parents[2] / "deploy" / "bundles" / "point"
+
+
+def layouts_of(world: str, count: int, radius: float) -> list[Layout]:
+    return [sample_layout(parse_world(world), seed, radius) for seed in range(count)]
+
+
+def verified(radius: float, proposer=None) -> VerifiedPlanner:
+    return VerifiedPlanner(proposer or WatchedPlanner(), ShortestPathPlanner(radius, soft_margin=0.15), radius)
+
+
+@pytest.fixture(scope="module")
+def network() -> GoseloPlanner:
+    bundle = load_bundle(BUNDLE)
+    return GoseloPlanner(load_policies(bundle).planner, bundle.manifest.goselo.channels, 0.1, 0.15)
+
+
+# free plans
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.2])
+@pytest.mark.parametrize("world", SIX_WORLDS)
+def test_with_repair_a_disc_touches_nothing_however_bad_the_proposals_are(world: str, radius: float) -> None:
+    layouts = layouts_of(world, 6, radius)
+    blind, checked = WatchedPlanner(), verified(radius)
+    assert walk(blind, layouts, radius).collisions.sum() > 0, "straight at the goal hits something in these worlds"
+    result = walk(checked, layouts, radius)
+    assert result.collisions.sum() == 0
+    assert result.reached.all()
+    assert checked.counts()["repairs"] > 0 and checked.refusals == 0
+    assert checked.proposals == result.plans.sum()
+
+
+@pytest.mark.parametrize("world", SIX_WORLDS)
+def test_with_repair_the_shipped_network_touches_nothing(world: str, network: GoseloPlanner) -> None:
+    result = walk(verified(0.1, network), layouts_of(world, 10, 0.1), 0.1)
+    assert result.collisions.sum() == 0 and result.reached.all()
+
+
+# refusals
+
+
+def walled(row: slice, half_size: float = 1.0) -> OccupancyMap:
+    occupancy = map_with_pillars(half_size=(half_size, half_size))
+    occupancy.occupied[:, row] = True
+    return occupancy
+
+
+@pytest.mark.parametrize(
+    ("reason", "occupancy", "start", "goal"),
+    [
+        ("enclosed", walled(slice(19, 21)), (-0.5, 0.0), (0.6, 0.0)),
+        ("goal_blocked", walled(slice(22, None)), (-0.5, 0.0), (0.8, 0.0)),
+        ("no_room", OccupancyMap(np.ones((40, 40), bool), origin=(-1.0, -1.0)), (-0.5, 0.0), (0.6, 0.0)),
+        ("not_finite", map_with_pillars(), (0.0, 0.0), (np.nan, 0.0)),
+    ],
+)
+def test_a_refusal_has_a_reason(reason: str, occupancy: OccupancyMap, start, goal) -> None:
+    planner = verified(0.1)
+    assert np.isnan(planner.plan(query_of([start], [goal], occupancy))).all()
+    assert planner.refusals == 1
+    assert planner.counts()[f"refusals/{reason}"] == 1 and reason in REFUSALS
+
+
+def test_a_goal_a_little_too_close_to_a_wall_is_gone_to_as_near_as_the_disc_fits() -> None:
+    occupancy = walled(slice(30, None))  # from x = 0.5 m on
+    goal = np.array([0.47, 0.0])
+    plan = PathField(occupancy, goal, 0.1).waypoints(np.array([0.0, 0.0]))
+    assert occupancy.is_free(plan, 0.1).all()
+    assert np.linalg.norm(plan[-1] - goal) < GOAL_REACH
+    assert PathField(occupancy, np.array([0.9, 0.0]), 0.1).waypoints(np.array([0.0, 0.0])) is None
+
+
+# hysteresis
+
+
+class Undecided:
+    """Left and right of the pillar ahead, with scores that change at random from one query to the next."""
+
+    def __init__(self, spread: float) -> None:
+        self.rng, self.spread = np.random.default_rng(1), spread
+
+    def __call__(self, image: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        along = 0.1 * np.arange(1, 11)
+        bow = 0.45 * np.sin(np.pi * np.minimum(along, 1.2) / 1.2)
+        plans = np.stack([np.stack([side * bow, along], axis=-1) for side in (-1.0, 1.0)])
+        scores = self.rng.normal(0.0, self.spread, (len(image), 2))
+        return np.repeat(plans[None], len(image), 0).astype(np.float32), scores
+
+
+def sides(planner, remember: bool, noise: float = 0.01) -> np.ndarray:
+    """On which side of the pillar ahead each of 40 plans of a robot that hardly moves passes."""
+    rng, occupancy = np.random.default_rng(0), map_with_pillars([(0.6, 0.0)])
+    previous, chosen = np.full((1, 10, 2), np.nan), []
+    for _ in range(40):
+        where = rng.normal(0.0, noise, (1, 2))
+        shown = previous if remember else np.full((1, 10, 2), np.nan)
+        previous = planner.plan(PlanQuery(where, np.array([[1.2, 0.0]]), [occupancy], [VisitMap(occupancy)], shown))
+        chosen.append(float(np.sign(previous[0, 5, 1])))
+    return np.array(chosen)
+
+
+def flips(chosen: np.ndarray) -> int:
+    return int(np.count_nonzero(np.diff(chosen)))
+
+
+def test_plans_of_equal_merit_do_not_flip_from_one_query_to_the_next() -> None:
+    assert flips(sides(GoseloPlanner(Undecided(0.2)), remember=False)) > 10
+    assert flips(sides(GoseloPlanner(Undecided(0.2)), remember=True)) == 0
+    assert flips(sides(verified(0.1, GoseloPlanner(Undecided(0.2))), remember=True)) == 0
+
+
+def test_a_much_better_score_is_a_cause_to_change_sides() -> None:
+    assert flips(sides(GoseloPlanner(Undecided(3.0)), remember=True)) > 0
+
+
+def test_the_shipped_network_keeps_to_its_side_of_obstacles(network: GoseloPlanner) -> None:
+    """A robot that stands, with a pose that is 2 cm wrong, before the worlds' obstacles: plans end where they did."""
+    changed = {True: 0, False: 0}
+    for layout in layouts_of("pillar(3,3,25)", 30, 0.1):
+        occupancy, goal = layout.occupancy(0.0), layout.goal[None]
+        for remember in changed:
+            rng, previous = np.random.default_rng(2), np.full((1, 10, 2), np.nan)
+            for _ in range(8):
+                where = layout.start[None, :2] + rng.normal(0.0, 0.02, (1, 2))
+                shown = previous if remember else np.full((1, 10, 2), np.nan)
+                plan = network.plan(PlanQuery(where, goal, [occupancy], [VisitMap(occupancy)], shown))
+                changed[remember] += int(np.linalg.norm(plan[0, -1] - previous[0, -1]) > 0.3)
+                previous = plan
+    assert changed[False] > 3 and changed[True] <= changed[False] / 3
+
+
+def test_the_distance_from_an_old_plan_is_that_of_what_is_left_of_it() -> None:
+    old = np.stack([0.1 * np.arange(1, 11), np.zeros(10)], axis=-1)[None]
+    aside, ahead = old + [0.0, 0.2], old + [0.5, 0.0]
+    position = np.array([[0.5, 0.0]])
+    apart = apart_from(old, position, np.stack([old[0], aside[0], ahead[0]])[None])
+    np.testing.assert_allclose(apart[0, :2], [0.0, 0.2], atol=1e-9)
+    assert apart[0, 2] < 0.02, "driven waypoints count no more"
+    assert np.isnan(apart_from(np.full_like(old, np.nan), position, old[:, None])).all()
