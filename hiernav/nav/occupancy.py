@@ -128,10 +128,14 @@ class VisitMap:
         finite, count nowhere.
         """
         for x, y in np.asarray(positions, dtype=np.float64).reshape(-1, 2).tolist():
-            pixel = self._pixel(x, y)
-            if pixel is not None and pixel != self._last_pixel and self.counts[pixel] < 255:
-                self.counts[pixel] += 1
-            self._last_pixel = pixel
+            self.enter(x, y)
+
+    def enter(self, x: float, y: float) -> None:
+        """`add` for one position."""
+        pixel = self._pixel(x, y)
+        if pixel is not None and pixel != self._last_pixel and self.counts[pixel] < 255:
+            self.counts[pixel] += 1
+        self._last_pixel = pixel
 
     def clear(self) -> None:
         """Forget every visit, as at the start of an episode."""

@@ -236,11 +236,11 @@ class WaypointOption:
         """
         rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-        for row, where, now in zip(rows.tolist(), position, occupancy, strict=True):
+        for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
             if visits is None:
                 visits = self.visits[row] = VisitMap(now)
-            visits.add(where)
+            visits.enter(*where)
         self.age[rows] += 1
         reason = self._reasons(rows, position, goal, occupancy)
         ended = (reason != _NONE) & (reason != _GOAL)

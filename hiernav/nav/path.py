@@ -36,8 +36,9 @@ def divide(line: np.ndarray, spacing: float) -> np.ndarray:
 
 def arc_lengths(line: np.ndarray) -> np.ndarray:
     """Arc length from the first vertex to each vertex: (N, V, 2) -> (N, V) [m]."""
-    steps = np.linalg.norm(np.diff(line, axis=1), axis=-1)
-    return np.concatenate([np.zeros((len(line), 1)), np.cumsum(steps, axis=1)], axis=1)
+    arc = np.zeros(line.shape[:2])
+    np.cumsum(_length(line[:, 1:] - line[:, :-1]), axis=1, out=arc[:, 1:])
+    return arc
 
 
 def point_at(line: np.ndarray, stations: np.ndarray, arc: np.ndarray | None = None) -> np.ndarray:
@@ -52,10 +53,11 @@ def point_at(line: np.ndarray, stations: np.ndarray, arc: np.ndarray | None = No
         (N, S, 2) points [m].
     """
     arc = arc_lengths(line) if arc is None else arc
-    segment = np.clip((arc[:, None, :] <= stations[:, :, None]).sum(-1) - 1, 0, line.shape[1] - 2)
+    segment = (arc[:, None, :] <= stations[:, :, None]).sum(-1) - 1
+    segment = np.minimum(np.maximum(segment, 0), line.shape[1] - 2)
     rows = np.arange(len(line))[:, None]
     begin, length = arc[rows, segment], arc[rows, segment + 1] - arc[rows, segment]
-    t = np.clip((stations - begin) / np.maximum(length, _TINY), 0.0, 1.0)[..., None]
+    t = _unit((stations - begin) / np.maximum(length, _TINY))[..., None]
     return (1.0 - t) * line[rows, segment] + t * line[rows, segment + 1]
 
 
@@ -70,8 +72,7 @@ def nearest_vertex(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray
         index (N, M) of the first nearest vertex, distance (N, M) [m]; NaN points give a NaN distance.
     """
     squared = np.square(points[:, :, None, :] - vertices[:, None, :, :]).sum(-1)
-    index = squared.argmin(-1)
-    return index, np.sqrt(np.take_along_axis(squared, index[..., None], axis=-1)[..., 0])
+    return squared.argmin(-1), np.sqrt(squared.min(-1))
 
 
 def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, spacing: float) -> np.ndarray:
@@ -85,9 +86,8 @@ def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, s
     Returns:
         (N,) max over the motion of the distance to the closest plan vertex [m]; NaN where a row is NaN.
     """
-    length = np.linalg.norm(after - before, axis=-1)
-    count = int(np.ceil(_longest(length) / spacing - 1e-9)) + 1
-    t = np.linspace(0.0, 1.0, max(count, 2))[None, :, None]
+    pieces = max(int(np.ceil(_longest(_length(after - before)) / spacing - 1e-9)), 1)
+    t = (np.arange(pieces + 1) / pieces)[None, :, None]
     motion = (1.0 - t) * before[:, None, :] + t * after[:, None, :]
     return nearest_vertex(motion, vertices)[1].max(axis=1)
 
@@ -111,17 +111,27 @@ def signed_progress(points: np.ndarray, line: np.ndarray, lookahead: float = 0.5
     Returns:
         (N,) [m], at most the length of the line.
     """
-    begin, edge = line[:, :-1], np.diff(line, axis=1)
+    begin, edge = line[:, :-1], line[:, 1:] - line[:, :-1]
     squared = np.square(edge).sum(-1)
     t = ((points[:, None, :] - begin) * edge).sum(-1) / np.maximum(squared, _TINY)
-    t = np.clip(t, 0.0, 1.0)
+    t = _unit(t)
     apart = np.square(points[:, None, :] - begin - t[..., None] * edge).sum(-1)
     rows, nearest = np.arange(len(line)), apart.argmin(-1)
     arc = arc_lengths(line)
     foot = arc[rows, nearest] + t[rows, nearest] * np.sqrt(squared[rows, nearest])
-    ahead = arc - np.linalg.norm(points[:, None, :] - line, axis=-1)
+    ahead = arc - _length(points[:, None, :] - line)
     ahead[arc > foot[:, None] + lookahead] = -np.inf
     return np.maximum(foot - np.sqrt(apart[rows, nearest]), ahead.max(axis=1))
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    """Lengths of (..., 2): few rows are the rule here, and `np.linalg.norm` takes its time to begin."""
+    return np.hypot(vectors[..., 0], vectors[..., 1])
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Values clamped to [0, 1]; `np.clip` takes longer to begin."""
+    return np.minimum(np.maximum(values, 0.0), 1.0)
 
 
 def _longest(lengths: np.ndarray) -> float:

@@ -104,10 +104,7 @@ class Layout:
 
     def in_field(self, positions: ArrayLike) -> NDArray[np.bool_]:
         """Positions (N, 2) [m] -> (N,) bool; the border belongs to the field, NaN does not."""
-        positions = np.asarray(positions, dtype=np.float64)
-        xmin, xmax, ymin, ymax = self.extent
-        x, y = positions[..., 0], positions[..., 1]
-        return (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
+        return inside(np.asarray(positions, dtype=np.float64), np.array(self.extent))
 
     def gremlin_positions(self, time: float) -> NDArray[np.float64]:
         """(G, 2) [m] at `time` [s]: all gremlins run on their circles at 1 rad/s and in phase."""
@@ -153,6 +150,12 @@ class Layout:
         centers, halves = wall_boxes(self.walls)
         draw_boxes(field.occupied, field.origin, field.resolution, centers, halves)
         return field
+
+
+def inside(positions: NDArray[np.float64], extent: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether positions (..., 2) [m] lie in extents (..., 4), edges included, NaN does not: (...) bool."""
+    x, y = positions[..., 0], positions[..., 1]
+    return (x >= extent[..., 0]) & (x <= extent[..., 1]) & (y >= extent[..., 2]) & (y <= extent[..., 3])
 
 
 def parse_world(text: str) -> WorldSpec:

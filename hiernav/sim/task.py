@@ -17,7 +17,7 @@ from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import OptionStep, WaypointOption, guided
 from hiernav.sim.batch import BatchSim
-from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec
+from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, inside
 from hiernav.sim.reward import reward_terms, weighted_sum
 from hiernav.sim.robots import RobotSpec
 from hiernav.sim.scene import scene_for
@@ -93,6 +93,7 @@ class NavigationTask:
         self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
         self._maps: list[OccupancyMap] = [None] * self.num_rows  # type: ignore[list-item]
         self.goal = np.zeros((self.num_rows, 2))
+        self._extent = np.zeros((self.num_rows, 4))
         self.steps = np.zeros(self.num_rows, dtype=np.int64)
         self._max_steps = np.zeros(self.num_rows, dtype=np.int64)
         self._points = np.full((self.num_rows, 1, 2), np.nan)
@@ -122,7 +123,7 @@ class NavigationTask:
         for row, layout in zip(rows, drawn, strict=True):
             self.layouts[row] = layout
             self._maps[row] = layout.occupancy(0.0)
-            self.goal[row] = layout.goal
+            self.goal[row], self._extent[row] = layout.goal, layout.extent
             self._max_steps[row] = min(layout.spec.max_steps, self._cap)
             self._moving[row] = len(layout.gremlins) > 0
             self._set_points(row, layout.obstacle_points(0.0))
@@ -133,9 +134,9 @@ class NavigationTask:
 
     def step(self, actions: np.ndarray) -> TaskStep:
         """One control step of all rows with actions (N, A) in [-1, 1]."""
-        if any(layout is None for layout in self.layouts):
+        if None in self.layouts:
             raise RuntimeError("reset every row of the task before its first step")
-        before, line = self.sim.pose[:, :2].copy(), self.option.line()
+        before, line = self.sim.pose[:, :2], self.option.line()
         self.sim.step(actions)
         self.steps += 1
         for row in np.flatnonzero(self._moving).tolist():
@@ -145,13 +146,14 @@ class NavigationTask:
         after = self.sim.pose[:, :2]
         broken = ~self.sim.finite
         reached = np.linalg.norm(after - self.goal, axis=-1) <= GOAL_RADIUS
-        left = ~np.array([layout.in_field(after[row][None])[0] for row, layout in enumerate(self.layouts)]) & ~broken
+        left = ~inside(after, self._extent) & ~broken
         reached &= ~left
         collided = self.sim.collided
         fallen = self.sim.upright < 0.0
         terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left, fallen)
-        terms = {name: np.where(broken, 0.0, values) for name, values in terms.items()}
-        option = self._observe(np.arange(self.num_rows))
+        if broken.any():
+            terms = {name: np.where(broken, 0.0, values) for name, values in terms.items()}
+        option = self._observe(None)
         return TaskStep(
             observation=self.observation,
             reward=weighted_sum(self.reward, terms),
@@ -165,17 +167,23 @@ class NavigationTask:
             option=option,
         )
 
-    def _observe(self, rows: np.ndarray) -> OptionStep:
-        """Let the options of some rows end or go on, then observe."""
-        pose = self.sim.pose[rows]
-        option = self.option.step(pose[:, :2], self.goal[rows], [self._maps[row] for row in rows], rows)
-        sensors = {name: values[rows] for name, values in self.sim.sensors.items()}
-        time = self.steps[rows] * self.robot.control_period
-        values = guided(sensors, pose, option.plan, self.goal[rows], time)
-        values["lidar"] = lidar_closeness(pose, self._points[rows])
-        observation = self.observation.copy()
-        observation[rows] = np.nan_to_num(self.layout.build(values))  # a broken row is reported, not passed on
-        self.observation = observation
+    def _observe(self, rows: np.ndarray | None) -> OptionStep:
+        """Let the options of some rows (all if None) end or go on, then observe."""
+        maps = self._maps if rows is None else [self._maps[row] for row in rows]
+        pick = slice(None) if rows is None else rows  # of all rows no copy is made
+        pose, goal = self.sim.pose[pick], self.goal[pick]
+        option = self.option.step(pose[:, :2], goal, maps, rows)
+        sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
+        values = guided(sensors, pose, option.plan, goal, self.steps[pick] * self.robot.control_period)
+        values["lidar"] = lidar_closeness(pose, self._points[pick])
+        built = self.layout.build(values)
+        if not np.isfinite(built).all():
+            built = np.nan_to_num(built)  # a broken row is reported, not passed on
+        if rows is None:
+            self.observation = built
+        else:
+            self.observation = self.observation.copy()
+            self.observation[rows] = built
         return option
 
     def _set_points(self, row: int, points: np.ndarray) -> None:
