@@ -1,0 +1,104 @@
+"""Updates of soft actor-critic per second, beside what they compete with."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from race import race, timed, typical
+
+
+def bench_update(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Doggo sizes, batch 256, the same batch again and again."""
+    import torch
+    from plain_sac import PlainSac
+    from sac_peers import ACTIONS, BATCH, torch_transitions
+    from tensordict import TensorDict
+
+    from hiernav.nav.observation import observation_layout
+    from hiernav.skill.sac import Learner, SacSettings
+
+    torch.set_num_threads(arguments.threads)
+    layout, hidden = observation_layout("doggo"), (arguments.hidden, arguments.hidden)
+    batch = TensorDict(torch_transitions(BATCH), [BATCH])
+    learners = {
+        precision: Learner(layout, ACTIONS, SacSettings(hidden, precision=precision))
+        for precision in ("auto", "float32")
+    }
+    plain = PlainSac(layout, ACTIONS, hidden)
+    left, right = torch.randn(BATCH, 256), torch.randn(256, 256)
+    contenders: dict[str, Callable[[], int]] = {
+        "hiernav": lambda: 1 if learners["auto"].update(batch) else 1,
+        "hiernav_float32": lambda: 1 if learners["float32"].update(batch) else 1,
+        "plain": lambda: plain.update(batch) or 1,
+        "matmul": lambda: 1 if left.mm(right) is not None else 1,
+    }
+    rates = typical(race({name: partial(timed, run) for name, run in contenders.items()}, arguments.seconds))
+    peak = rates.pop("matmul") * 2 * BATCH * 256 * 256
+    flops = update_flops(layout.size, ACTIONS, BATCH, arguments.hidden)
+    for name, rate in rates.items():
+        ratio = f"{rate / rates['plain']:.2f} of plain torch"
+        print(f"update {name:16s} {rate:6.0f}/s   {ratio}   {rate * flops / peak:.2f} of the float32 peak")
+    print(f"update float32 peak {peak / 1e9:.0f} GFLOP/s, {flops / 1e9:.2f} GFLOP an update")
+    return {"updates_per_s": rates, "peak_gflops": peak / 1e9, "gflop_per_update": flops / 1e9}
+
+
+def bench_peers(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Every learner in a process of its own, taking turns; drawing the batches included."""
+    from sac_peers import LEARNERS, PEERS
+
+    print("peers: starting", end="", flush=True)
+    options = ["--threads", str(arguments.threads), "--hidden", str(arguments.hidden)]
+    workers, skipped = {}, {}
+    for name in LEARNERS:
+        print(f" {name}", end="", flush=True)
+        python = arguments.peer_python if name in ("sb3", "sbx") else sys.executable
+        worker = subprocess.Popen(
+            [python, "-W", "ignore", str(Path(__file__).parent / "sac_peers.py"), name, *options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        # libraries print to the same stream
+        lines = iter(worker.stdout.readline, "")  # type: ignore[union-attr]
+        answer = next((line.strip() for line in lines if line.startswith(("ready", "skip"))), "skip it ended")
+        if answer == "ready":
+            workers[name] = worker
+        else:
+            skipped[name] = answer.removeprefix("skip ")
+    print()
+
+    def turn(worker: subprocess.Popen[str], seconds: float) -> tuple[int, float]:
+        print(seconds, file=worker.stdin, flush=True)
+        count, spent = worker.stdout.readline().split()  # type: ignore[union-attr]
+        return int(count), float(spent)
+
+    try:
+        rates = typical(race({name: partial(turn, worker) for name, worker in workers.items()}, arguments.seconds))
+    finally:
+        for worker in workers.values():
+            worker.stdin.close()  # type: ignore[union-attr]
+            worker.wait()
+    best = max((rates[name] for name in PEERS if name in rates), default=float("nan"))
+    for name, rate in rates.items():
+        print(
+            f"peers {name:16s} {rate:6.0f}/s   {rate / rates['plain']:.2f} of plain, {rate / best:.2f} of the best peer"
+        )
+    for name, reason in skipped.items():
+        print(f"peers {name:16s} skipped: {reason}")
+    return {"updates_per_s": rates, "skipped": skipped}
+
+
+def update_flops(observation: int, actions: int, batch: int, width: int) -> float:
+    """Floating point operations of the matrix products of one update."""
+    actor = observation * width + width * width + width * 2 * actions
+    critic = (observation + actions) * width + width * width + width
+    forward = actor + 2 * critic  # target: next action, twin targets
+    forward += 3 * 2 * critic  # critic loss: forward, gradients of weights and inputs
+    forward += 3 * actor + 2 * 2 * critic  # actor loss: twin critics forward and input gradients
+    return 2.0 * batch * forward
