@@ -62,7 +62,8 @@ class BatchSim:
         self._pool = ObstaclePool(scene)
         self._joints = JointReader(robot, self.model)
         self.datas = [mujoco.MjData(self.model) for _ in range(num_envs)]
-        self._views = [(d.ctrl, d.qpos, d.qvel, d.sensordata, d.history) for d in self.datas]
+        self._ctrl = [d.ctrl for d in self.datas]
+        self._views = [[getattr(d, name) for d in self.datas] for name in ("qpos", "qvel", "sensordata", "history")]
         self._gremlins: dict[int, Layout] = {}
         self._sensor_columns = {
             name: slice(self.model.sensor(name).adr[0], self.model.sensor(name).adr[0] + 3) for name in BASE_SENSORS
@@ -70,11 +71,9 @@ class BatchSim:
         self._contact_columns = [_history_values(self.model, name) for name in CONTACT_SENSORS]
         self._chunks = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(threads, num_envs))]
         self._workers = ThreadPoolExecutor(len(self._chunks) - 1, "batch-sim") if len(self._chunks) > 1 else None
-        self._allocate()
         self.collided = np.zeros(num_envs, bool)
         for data in self.datas:
             mujoco.mj_forward(self.model, data)
-        self._gather(range(num_envs))
         self._publish()
 
     def reset(self, rows: np.ndarray, layouts: Sequence[Layout]) -> None:
@@ -100,8 +99,6 @@ class BatchSim:
             self._gremlins.pop(row, None)
             if len(layout.gremlins):
                 self._gremlins[row] = layout
-        self._allocate()
-        self._gather(range(self.num_envs))
         self.collided = self.collided.copy()
         self.collided[rows] = False
         self._publish()
@@ -122,7 +119,6 @@ class BatchSim:
         for row, layout in self._gremlins.items():
             data = self.datas[row]
             self._pool.move_gremlins(layout, data.time, data.mocap_pos)
-        self._allocate()
         if self._workers is None:
             self._step_rows(self._chunks[0])
         else:
@@ -130,8 +126,8 @@ class BatchSim:
             self._step_rows(self._chunks[0])
             for future in futures:
                 future.result()
-        total, floor, own = (self._history[:, columns] for columns in self._contact_columns)
-        self._publish()
+        history = self._publish()
+        total, floor, own = (history[:, columns] for columns in self._contact_columns)
         self.collided = (total > floor + own).any(axis=1) & self.finite
 
     def close(self) -> None:
@@ -143,40 +139,25 @@ class BatchSim:
         model, substeps, controls, finite = self.model, self.robot.substeps, self._controls, self.finite
         for row in rows:
             if finite[row]:
-                self._views[row][0][:] = controls[row]
+                self._ctrl[row][:] = controls[row]
                 mujoco.mj_step(model, self.datas[row], nstep=substeps)
-        self._gather(rows)
 
-    def _allocate(self) -> None:
-        """New arrays for the rows to be gathered into, so that what was published before stays as it was."""
-        n, model = self.num_envs, self.model
-        self._state = np.empty((n, model.nq + model.nv))
-        self._readings = np.empty((n, model.nsensordata))
-        self._history = np.empty((n, model.nhistory))
-        self.time = np.empty(n)
-
-    def _gather(self, rows: Sequence[int]) -> None:
-        nq, state, readings, history, time = self.model.nq, self._state, self._readings, self._history, self.time
-        for row in rows:
-            _, row_qpos, row_qvel, row_readings, row_history = self._views[row]
-            state[row, :nq] = row_qpos
-            state[row, nq:] = row_qvel
-            readings[row] = row_readings
-            history[row] = row_history
-            time[row] = self.datas[row].time
-
-    def _publish(self) -> None:
-        robot, nq, state = self.robot, self.model.nq, self._state
+    def _publish(self) -> np.ndarray:
+        """Read all simulations into new arrays; returns the histories (N, H) of the sensors that have one."""
+        robot = self.robot
+        # one call for all rows: copying row by row takes longer than everything else in here
+        qpos, qvel, readings, history = (np.concatenate(views).reshape(self.num_envs, -1) for views in self._views)
+        self.time = np.array([data.time for data in self.datas])
         # a comparison with NaN is False
-        self.finite = np.abs(state).max(axis=1) < STATE_LIMIT
+        self.finite = (np.abs(qpos).max(axis=1) < STATE_LIMIT) & (np.abs(qvel).max(axis=1) < STATE_LIMIT)
         if not self.finite.all():
-            state[~self.finite] = np.nan
-        qpos, qvel = state[:, :nq], state[:, nq:]
+            qpos[~self.finite] = qvel[~self.finite] = np.nan
         self.pose = robot.pose(qpos)
         self.velocity = robot.velocity(qvel)
         self.upright = robot.upright(qpos)
-        self.sensors = {name: self._readings[:, columns] for name, columns in self._sensor_columns.items()}
+        self.sensors = {name: readings[:, columns] for name, columns in self._sensor_columns.items()}
         self.sensors |= self._joints.read(qpos, qvel)
+        return history
 
 
 def _history_values(model: mujoco.MjModel, sensor: str) -> slice:
