@@ -137,6 +137,11 @@ class VisitMap:
             self.counts[pixel] += 1
         self._last_pixel = pixel
 
+    def count_in(self, counts: NDArray[np.uint8]) -> None:
+        """Go on counting in another array of the same shape, such as memory that another process reads."""
+        counts[:] = self.counts
+        self.counts = counts
+
     def clear(self) -> None:
         """Forget every visit, as at the start of an episode."""
         self.counts = np.zeros_like(self.counts)

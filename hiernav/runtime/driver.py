@@ -114,7 +114,7 @@ class Driver:
         """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
         self.last_result: RunResult | None = None
         """Of the goal that ended last."""
-        self._truth: Callable[[], Truth] | None = getattr(robot, "truth", None)
+        self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._requests: deque[Callable[[float], None]] = deque()
         self._trip: Trip | None = None
         self._ended: Trip | None = None

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.runtime.clock import Clock
+from hiernav.runtime.clock import Clock, MonotonicClock
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame, Truth
 from hiernav.sim.batch import BatchSim
-from hiernav.sim.robots import RobotSpec
+from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.scene import SceneSpec, scene_for
-from hiernav.sim.worlds import Layout
+from hiernav.sim.worlds import Layout, parse_world, sample_layout
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,20 @@ class SensorNoise:
 
 EXACT = SensorNoise(accelerometer=0.0, gyro=0.0, magnetometer=0.0, velocimeter=0.0, fix=0.0)
 """Sensors without errors; the fix still comes at its own rate."""
+
+
+def make(robot: str, world: str, seed: int = 0, noise: dict[str, Any] | None = None) -> SimRobot:
+    """A simulated robot in real time, for `ProcessRobot`.
+
+    Args:
+        robot: "point", "car" or "doggo".
+        world: kind of world, as on the command line.
+        seed: of the world and of the noise; `SimRobot.restart` takes another one.
+        noise: fields of `SensorNoise` that differ from their defaults.
+    """
+    spec = get_robot(robot)
+    layout = sample_layout(parse_world(world), seed, spec.radius)
+    return SimRobot(spec, layout, SensorNoise(**(noise or {})), seed, MonotonicClock())
 
 
 class SimRobot:
@@ -112,6 +127,10 @@ class SimRobot:
         self._pending: deque[tuple[float, float, np.ndarray]] = deque()
         self._next_fix = 0.0
         self._frame: SensorFrame | None = None
+
+    def restart(self, seed: int) -> None:
+        """Start anew in another world of the same kind, with the noise of `seed`."""
+        self.reset(sample_layout(self.layout.spec, seed, self.spec.radius), seed)
 
     def read(self) -> SensorFrame:
         self._catch_up()

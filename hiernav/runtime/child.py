@@ -1,0 +1,68 @@
+"""Starting a process that shares memory with this one, and telling it that there is news."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class Child:
+    """A Python process that runs a module of this package, of this process's kin and in a session of its own.
+
+    A terminal's Ctrl-C does not reach it: it ends when its `news` pipe is closed, be it by `close` or because this
+    process is gone.
+    """
+
+    def __init__(self, module: str, arguments: Sequence[object] = (), descriptors: Sequence[int] = ()) -> None:
+        """Run `python -m module NEWS ARGUMENT ...`; NEWS is the descriptor on which `nudge` arrives."""
+        news, self._news = os.pipe()
+        os.set_blocking(self._news, False)
+        package = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", module, str(news), *map(str, arguments)],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(news, *descriptors),
+                start_new_session=True,
+                env={**os.environ, **ONE_THREAD, "PYTHONPATH": path},
+            )
+        finally:
+            os.close(news)
+
+    @property
+    def ended(self) -> int | None:
+        """Its exit status, negative for a signal; None while it lives."""
+        return self.process.poll()
+
+    def nudge(self, news: bytes = b"n") -> None:
+        """Wake it. Never waits: where nobody has looked for long, one wake more or less is no matter."""
+        try:
+            os.write(self._news, news)
+        except (BlockingIOError, BrokenPipeError):
+            pass
+
+    def close(self, patience: float = 2.0) -> None:
+        """Have it end by itself, or kill it after `patience` [s]."""
+        if self._news < 0:
+            return
+        os.close(self._news)
+        self._news = -1
+        try:
+            self.process.wait(patience)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def wait_for_news(news: int, timeout: float | None) -> bytes | None:
+    """In the child: what `nudge` wrote since the last call; b"" after `timeout` [s], None when the parent is gone."""
+    if not select.select([news], [], [], timeout)[0]:
+        return b""
+    return os.read(news, 4096) or None

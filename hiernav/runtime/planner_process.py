@@ -1,0 +1,126 @@
+"""The planner in a process of its own: a keeper starts it, restarts it where it dies or hangs, and ends it.
+
+Run as `python -m hiernav.runtime.planner_process NEWS QUESTIONS MEMORY` by `ProcessPlanner`. The keeper has imported
+everything before it forks the planner, so that a restart takes milliseconds, and none of them in the control process.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import sys
+import time
+
+import numpy as np
+
+from hiernav.nav.goselo import CHANNELS
+from hiernav.nav.option import Planner, PlanQuery
+from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
+from hiernav.runtime.child import wait_for_news
+from hiernav.runtime.mailbox import mapped
+from hiernav.runtime.planner_memory import PlannerMemory, Reply
+from hiernav.runtime.policy import OnnxPlannerNetwork
+
+MAX_RESTARTS = 3
+RESTART, FORGIVE = b"r", b"f"
+
+
+def main() -> None:
+    news, questions, descriptor = map(int, sys.argv[1:4])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    keep(news, questions, PlannerMemory(mapped(descriptor)))
+
+
+def keep(news: int, questions: int, memory: PlannerMemory) -> None:
+    """Keep one planner running until the control process closes `news`, with `MAX_RESTARTS` restarts."""
+    gc.freeze()
+    planner = _start(news, questions, memory)
+    watched = os.pidfd_open(planner)
+    while True:
+        ready = select.select([news, watched] if watched >= 0 else [news], [], [])[0]
+        wish = wait_for_news(news, 0.0) if news in ready else b""
+        if wish is None:
+            break
+        if RESTART in wish and planner:
+            os.kill(planner, signal.SIGKILL)
+        if FORGIVE in wish:
+            memory.set_status("restarts", 0)
+        if planner and (watched in ready or RESTART in wish):
+            os.waitpid(planner, 0)
+            os.close(watched)
+            planner, watched = 0, -1
+        if not planner:
+            if memory.status.restarts < MAX_RESTARTS:
+                memory.set_status("restarts", memory.status.restarts + 1)
+                planner = _start(news, questions, memory)
+                watched = os.pidfd_open(planner)
+            memory.set_status("exhausted", int(not planner))
+    if planner:
+        os.kill(planner, signal.SIGKILL)
+        os.waitpid(planner, 0)
+
+
+def _start(news: int, questions: int, memory: PlannerMemory) -> int:
+    memory.set_status("starts", memory.status.starts + 1)
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            os.close(news)
+            memory = memory.reopened()  # goes on where the last planner ended
+            answer_questions(questions, memory, make_planner(memory))
+            code = 0
+        finally:
+            os._exit(code)
+    memory.set_status("pid", pid)
+    return pid
+
+
+def make_planner(memory: PlannerMemory) -> Planner:
+    """The planner that the settings describe, warmed up by one question."""
+    settings = memory.settings
+    expert = ShortestPathPlanner(
+        settings["planning_radius_m"],
+        settings["soft_margin_m"],
+        num_waypoints=memory.waypoints,
+        spacing=settings["spacing_m"],
+    )
+    if not memory.model:
+        return expert
+    network = OnnxPlannerNetwork(memory.model)
+    channels = tuple(settings["channels"])
+    network(np.zeros((1, len(channels), 64, 64), np.uint8), np.ones(1, np.float32))
+    return VerifiedPlanner(
+        GoseloPlanner(network, channels or CHANNELS, settings["planning_radius_m"]), expert, settings["robot_radius"]
+    )
+
+
+def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) -> None:
+    """Answer the newest question again and again, until the control process closes `questions`."""
+    memory.set_status("ready", memory.status.starts)
+    version, occupancy = -1, None
+    while wait_for_news(questions, None) is not None:
+        question = memory.question()
+        if question is None:
+            continue
+        if question.map_version != version:
+            version, occupancy = question.map_version, memory.read_map(question.map_version)
+        if occupancy is None:  # a newer map, and a newer question with it, are on their way
+            version = -1
+            continue
+        began = time.perf_counter()
+        query = PlanQuery(
+            question.position[None],
+            question.goal[None],
+            [occupancy],
+            [memory.read_visits(occupancy)],
+            question.previous[None],
+        )
+        plan = planner.plan(query)[0]
+        memory.reply(Reply(question.number, plan, time.perf_counter() - began))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""The control process's side of a planner in a process of its own: never waits, watches its age, restarts it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+
+from hiernav.nav.bundle import Bundle
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.option import PlanQuery
+from hiernav.runtime.child import Child
+from hiernav.runtime.mailbox import mapped, shared_memory
+from hiernav.runtime.pilot import Answer
+from hiernav.runtime.planner_memory import PlannerMemory, Question, Status
+from hiernav.runtime.timing import Histogram
+
+_REMEMBERED = 256
+
+
+@dataclass(frozen=True)
+class _Asked:
+    stamp: float
+    position: np.ndarray
+    occupancy: OccupancyMap
+
+
+class ProcessPlanner:
+    """A `PlannerLink` to a process that is started here.
+
+    A question is put into a mailbox that holds one: the planner, when it is free, finds the newest. A planner that
+    does not answer for `hang_after` is killed and started again, as is one that has died; three restarts are granted.
+    """
+
+    def __init__(self, bundle: Bundle, robot_radius: float, map_pixels: int, hang_after: float = 0.5) -> None:
+        """
+        Args:
+            bundle: verified policies; the planner gets the bytes that were verified.
+            robot_radius: disc with which plans are swept against the map [m].
+            map_pixels: of the largest map that will be asked with.
+            hang_after: time without an answer after which the planner is started again [s].
+        """
+        manifest = bundle.manifest
+        settings = json.dumps(
+            {
+                "planning_radius_m": manifest.plan.planning_radius_m,
+                "soft_margin_m": manifest.plan.soft_margin_m,
+                "spacing_m": manifest.plan.spacing_m,
+                "channels": manifest.goselo.channels,
+                "robot_radius": robot_radius,
+            }
+        ).encode()
+        waypoints = manifest.plan.waypoints
+        self.stamp = 0.0
+        self.hang_after = hang_after
+        self.plan_time = Histogram()
+        """How long the planner took, as it says itself."""
+        self._descriptor = shared_memory(PlannerMemory.size(map_pixels, waypoints, settings, bundle.planner))
+        self._memory = PlannerMemory.create(mapped(self._descriptor), map_pixels, waypoints, settings, bundle.planner)
+        read, self._questions = os.pipe()
+        os.set_blocking(self._questions, False)
+        self._child = Child("hiernav.runtime.planner_process", (read, self._descriptor), (read, self._descriptor))
+        os.close(read)
+        self._asked: OrderedDict[int, _Asked] = OrderedDict()
+        self._number = self._wanted_from = 0
+        self._map: OccupancyMap | None = None
+        self._map_version = 0
+        self._visits: VisitMap | None = None
+        self._silent_since: float | None = None
+        self._restarting = 0
+
+    @property
+    def status(self) -> Status:
+        """Of the planner's process."""
+        return self._memory.status
+
+    @property
+    def ready(self) -> bool:
+        """Whether the planner has loaded its network and waits for questions."""
+        status = self.status
+        return status.ready == status.starts > 0
+
+    @property
+    def failed(self) -> str | None:
+        status = self.status
+        if status.exhausted:
+            return f"the planner's process failed again after {status.restarts} restarts"
+        code = self._child.ended
+        return None if code is None else f"the planner's keeper ended with status {code}"
+
+    def restart_count(self) -> int:
+        return self.status.restarts
+
+    def renew(self) -> None:
+        self._child.nudge(b"f")
+        self._silent_since = None
+
+    def plan(self, query: PlanQuery) -> None:
+        """Ask with the newest state; the answer comes by `answer`."""
+        occupancy, visits = query.occupancy[0], query.visits[0]
+        if occupancy is not self._map:
+            self._map, self._map_version = occupancy, self._map_version + 1
+            self._memory.write_map(self._map_version, occupancy)
+        if visits is not self._visits:
+            visits.count_in(self._memory.visits_of(visits))
+            self._visits = visits
+        self._number += 1
+        self._asked[self._number] = _Asked(self.stamp, query.position[0].copy(), occupancy)
+        if len(self._asked) > _REMEMBERED:
+            self._asked.popitem(last=False)
+        self._memory.ask(Question(self._number, query.position[0], query.goal[0], query.previous[0], self._map_version))
+        try:
+            os.write(self._questions, b"q")
+        except (BlockingIOError, BrokenPipeError):  # it has not looked for long, or is gone: noticed by its silence
+            pass
+
+    def answer(self, now: float) -> Answer | None:
+        reply = self._memory.answer()
+        asked = None
+        if reply is not None:
+            self._silent_since = None
+            self.plan_time.record(reply.seconds)
+            asked = self._asked.get(reply.number)
+            wanted = reply.number >= self._wanted_from
+            while self._asked and next(iter(self._asked)) <= reply.number:
+                self._asked.popitem(last=False)
+            if not wanted:
+                asked = None
+        self._watch(now)
+        if asked is None or reply is None:
+            return None
+        self._wanted_from = self._number + 1  # what was asked meanwhile was asked for the same plan
+        self._asked.clear()
+        return Answer(reply.plan, asked.position, asked.stamp, asked.occupancy)
+
+    def forget(self) -> None:
+        self._wanted_from = self._number + 1
+        self._asked.clear()
+        self._silent_since = None
+
+    def close(self) -> None:
+        """End the planner's process."""
+        if self._questions >= 0:
+            os.close(self._questions)
+            self._questions = -1
+            self._child.close()
+            os.close(self._descriptor)
+
+    def _watch(self, now: float) -> None:
+        """Have a planner that hangs started again. One that is being started is given three times as long."""
+        if not self._asked:
+            self._silent_since = None
+        elif self._silent_since is None:
+            self._silent_since = now
+        elif now - self._silent_since > (self.hang_after if self.ready else 3.0 * self.hang_after):
+            self._silent_since = now
+            self._child.nudge(b"r")

@@ -1,0 +1,148 @@
+"""The control process's side of a robot whose adapter lives in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hiernav.runtime.child import Child
+from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
+from hiernav.runtime.robot import SensorFrame, Truth
+from hiernav.runtime.robot_process import BRAKE, END, STATUS
+from hiernav.runtime.wire import CAPACITY, decode_frame
+
+
+class ProcessRobot:
+    """A `Robot` behind two mailboxes: reading and sending never wait for the adapter.
+
+    The adapter's watchdog brakes the robot if no command comes, whether this process is slow, stopped or dead.
+    """
+
+    def __init__(self, robot: str, arguments: Mapping[str, Any] | None = None, patience: float = 20.0) -> None:
+        """
+        Args:
+            robot: what makes the robot over there: "package.module:function" or "file.py:function".
+            arguments: of that function, as JSON can hold them.
+            patience: time the robot may take to start, and to answer a `call` [s].
+
+        Raises:
+            RuntimeError: the adapter did not start.
+        """
+        size = STATUS + 2 * Mailbox.size(CAPACITY)
+        self._descriptor = shared_memory(size)
+        memory = self._memory = mapped(self._descriptor)
+        self._status = np.frombuffer(memory, np.float64, 4)
+        self._commands = Mailbox(memory, STATUS, CAPACITY)
+        self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
+        self._calls, theirs = socket.socketpair()
+        self._calls.settimeout(patience)
+        settings = json.dumps({"robot": robot, "arguments": dict(arguments or {})})
+        with theirs:
+            self.child = Child(
+                "hiernav.runtime.robot_process",
+                (theirs.fileno(), self._descriptor, settings),
+                (theirs.fileno(), self._descriptor),
+            )
+        self._facts: dict[str, Any] | None = None
+        self._newest: tuple[SensorFrame, Truth | None] | None = None
+
+    @property
+    def control_period(self) -> float:
+        return float(self._wait_for_start()["control_period"])
+
+    @property
+    def action_dim(self) -> int:
+        return int(self._wait_for_start()["action_dim"])
+
+    @property
+    def realtime(self) -> Mapping[str, str]:
+        """What the system granted the adapter (`request_realtime`)."""
+        return self._wait_for_start()["realtime"]
+
+    @property
+    def watchdog_trips(self) -> int:
+        """How often the adapter braked because no command came."""
+        return int(self._status[0])
+
+    @property
+    def last_trip(self) -> float:
+        """When it last did, on the monotonic clock [s]."""
+        return float(self._status[1])
+
+    def read(self) -> SensorFrame:
+        """The newest frame.
+
+        Raises:
+            RuntimeError: the adapter has ended.
+        """
+        message = self._frames.get()
+        if message is not None:
+            self._newest = decode_frame(message)
+        elif self.child.ended is not None:
+            raise RuntimeError(f"the robot's adapter ended with status {self.child.ended}")
+        if self._newest is None:
+            self._wait_for_start()
+            return self.read()
+        return self._newest[0]
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        sent = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+        if sent.shape != (self.action_dim,) or not np.isfinite(sent).all():
+            raise ValueError(f"ProcessRobot.send: action {action} is not {self.action_dim} finite numbers")
+        self._commands.put(sent.tobytes())
+        self.child.nudge()
+        return sent
+
+    def brake(self) -> None:
+        self._commands.put(BRAKE)
+        self.child.nudge()
+
+    def truth(self) -> Truth | None:
+        """Of a simulated robot, at the newest frame; None of a real one."""
+        self.read()
+        return None if self._newest is None else self._newest[1]
+
+    def call(self, method: str, **arguments: Any) -> Any:
+        """Call a method of the robot over there, and wait for it. Not for use while it is driven.
+
+        Raises:
+            RuntimeError: the method raised, or the adapter does not answer.
+        """
+        self._wait_for_start()
+        self._calls.sendall(json.dumps({"method": method, "arguments": arguments}).encode() + b"\n")
+        answer = self._receive()
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        self._newest = None
+        return answer["result"]
+
+    def close(self) -> None:
+        """Have the adapter brake the robot, release it, and end."""
+        if self._descriptor >= 0:
+            self.child.nudge(END)
+            self.child.close(patience=5.0)
+            self._calls.close()
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _wait_for_start(self) -> dict[str, Any]:
+        if self._facts is None:
+            self._facts = self._receive()
+        return self._facts
+
+    def _receive(self) -> dict[str, Any]:
+        line = b""
+        while not line.endswith(b"\n"):
+            try:
+                part = self._calls.recv(65536)
+            except TimeoutError:
+                raise RuntimeError(f"the robot's adapter does not answer for {self._calls.gettimeout()} s") from None
+            if not part:
+                raise RuntimeError(f"the robot's adapter ended with status {self.child.process.wait(5.0)}")
+            line += part
+        return json.loads(line)

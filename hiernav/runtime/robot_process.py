@@ -1,0 +1,161 @@
+"""A robot's adapter in a process of its own, which brakes by itself when commands stop coming.
+
+Run as `python -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to the
+control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hiernav.runtime.child import wait_for_news
+from hiernav.runtime.mailbox import Mailbox, mapped
+from hiernav.runtime.realtime import request_realtime
+from hiernav.runtime.robot import CommandWatchdog, Robot
+from hiernav.runtime.wire import CAPACITY, encode_frame
+
+BRAKE = b"brake"
+END = b"e"
+"""News that this process is not needed any more."""
+STATUS = 64
+"""Bytes at the front of the memory: what the watchdog has done."""
+LAST_BRAKES = 1.0
+"""Time for which a robot is braked whose control process is gone, before it is released [s]."""
+
+
+def main() -> None:
+    news, calls, descriptor = map(int, sys.argv[1:4])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    settings = json.loads(sys.argv[4])
+    robot = make_robot(settings["robot"], settings["arguments"])
+    Adapter(robot, news, calls, descriptor).run()
+
+
+def make_robot(name: str, arguments: dict[str, Any]) -> Robot:
+    """Call what `name` says, "package.module:function" or "path/to/file.py:function", with `arguments`.
+
+    Raises:
+        ValueError: there is no such function.
+    """
+    place, _, function = name.partition(":")
+    if not function:
+        raise ValueError(f"robot {name!r}: expected module:function or file.py:function")
+    if place.endswith(".py"):
+        spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+        if spec is None or spec.loader is None or not Path(place).is_file():
+            raise ValueError(f"robot {name!r}: there is no such file")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+    else:
+        module = importlib.import_module(place)
+    make: Callable[..., Robot] | None = getattr(module, function, None)
+    if make is None:
+        raise ValueError(f"robot {name!r}: {place} has no {function!r}")
+    return make(**arguments)
+
+
+class Adapter:
+    """Hands commands to the robot as they come, and frames back; brakes if none came in time."""
+
+    def __init__(self, robot: Robot, news: int, calls: int, descriptor: int) -> None:
+        self.robot = robot
+        self.watchdog = CommandWatchdog(robot.control_period)
+        self._news, self._calls = news, calls
+        memory = self._memory = mapped(descriptor)
+        self._status = np.frombuffer(memory, np.float64, 4)
+        self._commands = Mailbox(memory, STATUS, CAPACITY)
+        self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
+        self._truth = getattr(robot, "truth", None)
+        self._shown: object = None
+        self._braked = 0.0
+
+    def run(self) -> None:
+        """Until the control process says so, or is gone."""
+        news: bytes | None = b""
+        robot, idle = self.robot, 0.25 * self.robot.control_period
+        granted = request_realtime()
+        facts = {"control_period": robot.control_period, "action_dim": robot.action_dim, "realtime": granted}
+        self._answer(facts)
+        self._publish()
+        while True:
+            ready = select.select([self._news, self._calls], [], [], idle)[0]
+            news = b""
+            if self._calls in ready and not self._take_call():
+                news = None
+                break
+            if self._news in ready:
+                news = wait_for_news(self._news, 0.0)
+            if news is None or END in news:
+                break
+            self._obey(time.monotonic())
+            self._publish()
+        robot.brake()
+        end = time.monotonic() + (LAST_BRAKES if news is None else 0.0)
+        while time.monotonic() < end:
+            robot.brake()
+            time.sleep(robot.control_period)
+        robot.close()
+
+    def _obey(self, now: float) -> None:
+        command = self._commands.get()
+        if command is not None:
+            self.watchdog.feed(now)
+            if command == BRAKE:
+                self.robot.brake()
+            else:
+                self.robot.send(np.frombuffer(command, np.float64))
+        elif self.watchdog.expired(now):
+            # once, then at the control rate: a bus may need the brake repeated, but not hundreds of times a second
+            trips = self.watchdog.trips
+            if trips > self._status[0]:
+                self._status[0], self._status[1] = trips, now
+                self.robot.brake()
+                self._braked = now
+            elif trips and now - self._braked >= self.robot.control_period:
+                self.robot.brake()
+                self._braked = now
+
+    def _publish(self) -> None:
+        frame = self.robot.read()
+        if frame is self._shown:
+            return
+        self._shown = frame
+        self._frames.put(encode_frame(frame, None if self._truth is None else self._truth()))
+
+    def _take_call(self) -> bool:
+        """Call one of the robot's own methods, such as `restart` of a simulated one; False if nobody asks any more."""
+        line = b""
+        while not line.endswith(b"\n"):
+            part = os.read(self._calls, 65536)
+            if not part:
+                return False
+            line += part
+        request = json.loads(line)
+        try:
+            answer = {"result": getattr(self.robot, request["method"])(**request["arguments"])}
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        self._shown = None
+        self._publish()
+        self._answer(answer)
+        return True
+
+    def _answer(self, answer: dict[str, Any]) -> None:
+        os.write(self._calls, json.dumps(answer).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main()
