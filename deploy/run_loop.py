@@ -1,10 +1,20 @@
 #!/usr/bin/env python3
 """Drive a robot with an exported bundle at a fixed rate, without torch.
 
-The simulated robot has noisy sensors; the policies see the estimate alone. Every drive leaves a picture, the run a
-summary on screen and as JSON. Ctrl-C brakes the robot, verifies that it stands, and still writes the summary.
+The robot is a simulated one with noisy sensors, or yours (--adapter); the policies see the estimate alone. In real time
+the planner and the robot's adapter live in processes of their own. Every drive in simulation leaves a picture, the run
+a summary on screen and as JSON. Ctrl-C brakes the robot, verifies that it stands, and still writes the summary.
 
-Exit codes: 0 done or interrupted; 1 a fault; 2 bad input; 3 a bundle that must not be used.
+  run_loop.py --episodes 10                       ten simulated worlds
+  run_loop.py --serve                             be ready for goals, until Ctrl-C
+  run_loop.py --tell "goal 1.2,-0.5"              command the loop that runs: goal X,Y, cancel, pause, resume, stop,
+                                                  acknowledge, status, quit
+  run_loop.py --dry-run                           check bundle, robot and host; nothing moves
+
+Settings (--set guard.slow_ttc=0.5, or a YAML file with sections) are those of driver, estimator, guard, realtime and
+noise.
+Exit codes: 0 done or interrupted; 1 a fault; 2 bad input; 3 a bundle that must not be used; 4 a goal that cannot be
+driven to.
 """
 
 from __future__ import annotations
@@ -12,10 +22,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,17 +36,23 @@ from rich.console import Console
 
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
-from hiernav.nav.search import is_solvable
-from hiernav.runtime.clock import FakeClock, MonotonicClock
-from hiernav.runtime.driver import Driver, DriverConfig
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
-from hiernav.runtime.guard import Guard, GuardConfig
-from hiernav.runtime.observe import Observer, TickRecord
+from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
+from hiernav.runtime.control import ControlServer, default_socket, parse_point, tell
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.dry_run import print_report, report
+from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.guard import Guard
+from hiernav.runtime.noise import EXACT
+from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
+from hiernav.runtime.process_planner import ProcessPlanner
+from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.sim_robot import EXACT, SensorNoise, SimRobot
+from hiernav.runtime.robot import Robot
+from hiernav.runtime.settings import Settings, load_settings
 from hiernav.runtime.summary import Episode, print_summary, summarise
+from hiernav.runtime.trip import RunResult
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.worlds import sample_layout
@@ -43,30 +61,31 @@ if TYPE_CHECKING:
     from hiernav.runtime.recorder import Recorder
 
 BUNDLES = Path(__file__).resolve().parent / "bundles"
-OK, FAULT, BAD_INPUT, BAD_BUNDLE = 0, 1, 2, 3
-TILT_LIMIT = np.deg2rad(75.0)
-"""Tilt at which a robot with a free base has fallen [rad]."""
+OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
+SIMULATED = "hiernav.runtime.sim_robot:make"
 
 
 class Drive(Observer):
     """What one drive looked like, collected tick by tick for its picture."""
 
-    def __init__(self, robot: SimRobot) -> None:
-        self.robot = robot
+    def __init__(self) -> None:
         self.path: list[np.ndarray] = []
         self.plans: list[np.ndarray] = []
         self.collisions: list[np.ndarray] = []
-        self.first_tick_age: float | None = None
+        self.armed_age: float | None = None
+
+    def event(self, event: Event) -> None:
+        if self.armed_age is None and event.values.get("mode") == "armed":
+            self.armed_age = process_age()
 
     def tick(self, record: TickRecord) -> None:
-        if self.first_tick_age is None:
-            self.first_tick_age = process_age()
-        truth = self.robot.truth()
-        self.path.append(truth.pose[:2])
+        if record.truth is None:
+            return
+        self.path.append(record.truth.pose[:2])
         if record.replanned and record.plan is not None:
             self.plans.append(record.plan)
-        if truth.collided:
-            self.collisions.append(truth.pose[:2])
+        if record.truth.collided:
+            self.collisions.append(record.truth.pose[:2])
 
     def draw(self, layout: Layout, file: Path, title: str) -> None:
         from hiernav.draw import draw_layout  # matplotlib takes long to import, and the loop need not wait for it
@@ -79,15 +98,18 @@ class Drive(Observer):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(_join_goal(sys.argv[1:] if argv is None else argv))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # until the loop runs, SIGTERM is a Ctrl-C
     try:
-        return _run(arguments)
+        if arguments.tell is not None:
+            return _tell(arguments)
+        return _dry_run(arguments) if arguments.dry_run else _run(arguments)
     except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
         print("run_loop: interrupted", file=sys.stderr)
         return OK
     except BundleError as error:
         print(f"run_loop: bundle refused: {error}", file=sys.stderr)
         return BAD_BUNDLE
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"run_loop: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
 
@@ -113,6 +135,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, default=1, metavar="N", help="how many worlds to cross (1)")
     parser.add_argument("--goal", metavar="X,Y", help="goal in the world frame [m]; the world's own by default")
     parser.add_argument("--exact", action="store_true", help="sensors without noise")
+    parser.add_argument("--adapter", metavar="FILE.py:FUNCTION", help="makes your robot (deploy/README.md)")
+    parser.add_argument("--planner", choices=("process", "sync"), help="where plans are made (process; sync if --fast)")
+    parser.add_argument("--settings", type=Path, metavar="YAML", help="sections of settings (deploy/ROBOT.yaml)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting, several times")
+    parser.add_argument("--serve", action="store_true", help="stay ready for goals instead of driving episodes")
+    parser.add_argument("--control", type=Path, metavar="SOCKET", help=f"for --tell and --serve ({default_socket()})")
+    parser.add_argument("--tell", metavar="COMMAND", help="command the loop that runs")
+    parser.add_argument("--dry-run", action="store_true", help="check everything, and move nothing")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/drive-TIME)")
     parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file with every tick (hiernav replay FILE)")
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
@@ -120,70 +150,183 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _tell(arguments: argparse.Namespace) -> int:
+    answer = tell(arguments.control or default_socket(), arguments.tell)
+    print(json.dumps(answer, indent=2))
+    return BAD_INPUT if "error" in answer else OK
+
+
+def _dry_run(arguments: argparse.Namespace) -> int:
+    spec = get_robot(arguments.robot)
+    settings = _settings(arguments, spec)
+    bundle = arguments.bundle or BUNDLES / spec.name
+    with ExitStack() as stack:
+        make = lambda: _process_robot(arguments, spec, settings, stack)  # noqa: E731
+        found = report(lambda: _open_bundle(bundle, spec), make, settings)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+    print_report(found)
+    if found["bundle"].get("error"):
+        return BAD_BUNDLE
+    return FAULT if found["robot"].get("error") else OK
+
+
+def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
+    """Those of the robot's file beside this one, unless another is named."""
+    own = Path(__file__).resolve().parent / f"{spec.name}.yaml"
+    path = arguments.settings or (own if own.exists() else None)
+    asked = {
+        "estimator": {"tilts": spec.free_base},
+        "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS},
+    }
+    settings = load_settings(path, arguments.set, asked)
+    return replace(settings, noise=EXACT) if arguments.exact else settings
+
+
+def _process_robot(
+    arguments: argparse.Namespace, spec: RobotSpec, settings: Settings, stack: ExitStack
+) -> ProcessRobot:
+    """The robot behind an adapter in its own process, which is closed with `stack`."""
+    if arguments.adapter:
+        name, given = arguments.adapter, {}
+    else:
+        noise = asdict(settings.noise)
+        given = {"robot": spec.name, "world": arguments.world, "seed": arguments.seed, "noise": noise}
+        name = SIMULATED
+    robot = ProcessRobot(name, given)
+    stack.callback(robot.close)
+    return robot
+
+
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.episodes < 1:
         raise ValueError(f"--episodes is {arguments.episodes}, it must be at least 1")
+    if arguments.fast and (arguments.serve or arguments.adapter or arguments.planner == "process"):
+        raise ValueError("--fast has no real time: it goes with none of --serve, --adapter and --planner process")
     spec, world = get_robot(arguments.robot), parse_world(arguments.world)
     goal = None if arguments.goal is None else _parse_goal(arguments.goal)
+    settings = _settings(arguments, spec)
     bundle = _open_bundle(arguments.bundle or BUNDLES / spec.name, spec)
-    layouts = [_layout(world, arguments.seed + k, spec, goal) for k in range(arguments.episodes)]
-    noise = EXACT if arguments.exact else SensorNoise()
-    clock = FakeClock() if arguments.fast else MonotonicClock()
-    robot = SimRobot(spec, layouts[0], noise, layouts[0].seed, None if arguments.fast else clock)
-    tilt_limit = TILT_LIMIT if spec.free_base else None
-    guard = Guard(spec.action_dim, GuardConfig(slew_limit=bundle.manifest.guard.slew_limit, tilt_limit=tilt_limit))
-    driver = Driver(
-        robot,
-        Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS)),
-        robot.occupancy,
-        clock,
-        Estimator(EstimatorConfig(tilts=spec.free_base)),
-        guard,
-        DriverConfig(goal_radius=GOAL_RADIUS, max_steps=world.max_steps),
-    )
-    recorder = _open_recorder(arguments, driver, bundle, spec)
-    out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
-    out.mkdir(parents=True, exist_ok=True)
-    granted = {} if arguments.fast else request_realtime()
+    with ExitStack() as stack:
+        # both start while the rest is made ready
+        remote = None if arguments.fast else _process_robot(arguments, spec, settings, stack)
+        layouts = [_layout(world, arguments.seed + k, spec, goal) for k in range(arguments.episodes)]
+        link = None
+        if not arguments.fast and arguments.planner != "sync":
+            link = ProcessPlanner(bundle, spec.radius, layouts[0].occupancy(0.0).occupied.size)
+            stack.callback(link.close)
+        episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
+        return episodes.serve() if arguments.serve else episodes.drive()
 
-    console, episodes, drives = Console(), [], []
-    for layout in layouts:
-        robot.reset(layout, layout.seed)
-        if driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people to look at
-            driver.supervisor.acknowledge(clock.now())
-        drive = Drive(robot)
-        driver.audience.observers = [drive, *filter(None, [recorder])]
-        result = driver.run(layout.goal)
-        truth = robot.truth()
-        distance = float(np.linalg.norm(truth.pose[:2] - layout.goal))
-        episodes.append(Episode(layout.seed, result, truth.collisions, distance))
-        drives.append(drive)
-        console.print(
-            f"seed {layout.seed}: {result.reason} after {result.steps} steps "
-            f"({result.seconds:.1f} s), {truth.collisions} collisions",
-            highlight=False,
+
+class Episodes:
+    """One loop and the worlds it drives through."""
+
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        layouts: Sequence[Layout],
+        spec: RobotSpec,
+        settings: Settings,
+        bundle: Bundle,
+        remote: ProcessRobot | None,
+        link: ProcessPlanner | None,
+    ) -> None:
+        self.arguments, self.layouts, self.remote, self.link = arguments, layouts, remote, link
+        self.layout = layouts[0]
+        clock: Clock
+        robot: Robot
+        if remote is not None:
+            clock, robot = MonotonicClock(), remote
+            self._reset: Callable[[Layout], object] = lambda layout: remote.call("restart", seed=layout.seed)
+        else:
+            from hiernav.runtime.sim_robot import SimRobot
+
+            simulated = SimRobot(spec, self.layout, settings.noise, self.layout.seed)
+            clock, robot = FakeClock(), simulated
+            self._reset = lambda layout: simulated.reset(layout, layout.seed)
+        guard = replace(settings.guard, slew_limit=bundle.manifest.guard.slew_limit)
+        self.driver = Driver(
+            robot,
+            Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS, link), link),
+            lambda stamp: self.layout.occupancy(stamp),
+            clock,
+            Estimator(settings.estimator),
+            Guard(spec.action_dim, guard),
+            replace(settings.driver, max_steps=self.layout.spec.max_steps),
         )
-        if driver.interrupted:
-            break
-    robot.close()
-    if recorder is not None:
-        recorder.close()
+        self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
+        self.out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.granted = {} if arguments.fast else request_realtime(settings.realtime)
+        self.console = Console()
 
-    summary = summarise(episodes, driver.timer, driver.loop, granted)
-    summary["recording"] = None if recorder is None else recorder.summary()
-    summary["startup_seconds"] = drives[0].first_tick_age
-    for file in filter(None, (out / "summary.json", arguments.json)):
-        file.write_text(json.dumps(summary, indent=2) + "\n")
-    if not arguments.no_pictures:
-        for layout, drive, episode in zip(layouts, drives, episodes, strict=False):
-            drive.draw(
-                layout, out / f"drive-{layout.seed}.png", f"{world}, seed {layout.seed}: {episode.result.reason}"
-            )
-    print_summary(summary, console)
-    if recorder is not None:
-        console.print(f"recording: {recorder}", highlight=False)
-    console.print(f"run folder: {out}", highlight=False)
-    return FAULT if any(episode.result.fault for episode in episodes) else OK
+    def drive(self) -> int:
+        """From start to goal in every world."""
+        episodes: list[Episode] = []
+        drives: list[Drive] = []
+        for layout in self.layouts:
+            self.layout = layout
+            if not self.arguments.adapter:
+                self._reset(layout)
+                if self.driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people
+                    self.driver.supervisor.acknowledge(self.driver.clock.now())
+            drives.append(Drive())
+            self._watch(drives[-1])
+            episodes.append(self._episode(layout, self.driver.run(layout.goal), drives[-1]))
+            if self.driver.interrupted or self.driver.supervisor.latched and self.arguments.adapter:
+                break
+        return self._finish(episodes, drives)
+
+    def serve(self) -> int:
+        """Ready for goals until interrupted."""
+        drive = Drive()
+        self._watch(drive)
+        path = self.arguments.control or default_socket()
+        with ControlServer(self.driver, path):
+            self.console.print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})", highlight=False)
+            self.driver.serve()
+        result = self.driver.last_result
+        return self._finish([] if result is None else [self._episode(self.layout, result, drive)], [drive])
+
+    def _watch(self, drive: Drive) -> None:
+        self.driver.audience.observers = [drive, *filter(None, [self.recorder])]
+
+    def _episode(self, layout: Layout, result: RunResult, drive: Drive) -> Episode:
+        truth = self.driver.truth()
+        collisions, distance = None, None
+        if truth is not None:
+            collisions, distance = truth.collisions, float(np.linalg.norm(truth.pose[:2] - layout.goal))
+        text = f"seed {layout.seed}: {result.reason} after {result.steps} steps ({result.seconds:.1f} s)"
+        if collisions is not None:
+            text += f", {collisions} collisions"
+        self.console.print(f"{text}{': ' + result.detail if result.detail else ''}", highlight=False)
+        return Episode(layout.seed, result, collisions, distance)
+
+    def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
+        if self.recorder is not None:
+            self.recorder.close()
+        summary = summarise(episodes, self.driver.timer, self.driver.loop, self.granted)
+        summary["recording"] = None if self.recorder is None else self.recorder.summary()
+        summary["startup_seconds"] = drives[0].armed_age
+        if self.remote is not None:
+            summary["adapter"] = {"watchdog_trips": self.remote.watchdog_trips, "realtime": dict(self.remote.realtime)}
+        if self.link is not None:
+            summary["planner"] = {"restarts": self.link.restart_count(), "seconds": self.link.plan_time.summary()}
+        for file in filter(None, (self.out / "summary.json", self.arguments.json)):
+            file.write_text(json.dumps(summary, indent=2) + "\n")
+        if not self.arguments.no_pictures:
+            for layout, drive, episode in zip(self.layouts, drives, episodes, strict=False):
+                if drive.path:
+                    title = f"{layout.spec}, seed {layout.seed}: {episode.result.reason}"
+                    drive.draw(layout, self.out / f"drive-{layout.seed}.png", title)
+        print_summary(summary, self.console)
+        if self.recorder is not None:
+            self.console.print(f"recording: {self.recorder}", highlight=False)
+        self.console.print(f"run folder: {self.out}", highlight=False)
+        if any(episode.result.fault for episode in episodes):
+            return FAULT
+        return BAD_GOAL if any(episode.result.refused for episode in episodes) else OK
 
 
 def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
@@ -220,6 +363,8 @@ def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | Non
     layout = sample_layout(world, seed, spec.radius)
     if goal is None:
         return layout
+    from hiernav.nav.search import is_solvable
+
     occupancy = layout.occupancy(0.0)
     if not layout.in_field(goal[None])[0]:
         xmin, xmax, ymin, ymax = layout.extent
@@ -248,12 +393,9 @@ def process_age() -> float | None:
 
 def _parse_goal(text: str) -> np.ndarray:
     try:
-        goal = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        goal = np.empty(0)
-    if goal.shape != (2,) or not np.isfinite(goal).all():
-        raise ValueError(f"--goal {text!r}: expected X,Y in metres, for example --goal 1.2,-0.5")
-    return goal
+        return parse_point(text)
+    except ValueError as error:
+        raise ValueError(f"--goal {error}") from None
 
 
 if __name__ == "__main__":

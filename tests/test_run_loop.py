@@ -141,7 +141,7 @@ def test_a_goal_of_ones_own_is_driven_to(script, able_bundle, tmp_path, capsys):
 @pytest.mark.parametrize("goal", ["1", "a,b", "1,2,3", "nan,0", "inf,0", "", "-1;2"])
 def test_a_malformed_goal_is_refused(refused, able_bundle, goal):
     line = refused(2, "--bundle", able_bundle, "--goal", goal)
-    assert f"--goal {goal!r}: expected X,Y in metres, for example --goal 1.2,-0.5" in line
+    assert f"--goal {goal!r}: expected X,Y in metres, for example 1.2,-0.5" in line
 
 
 def test_a_goal_outside_the_field_is_refused_with_its_extent(refused, able_bundle):
@@ -224,10 +224,10 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"summary.json", f"drive-{seed}.png", f"drive-{seed + 1}.png"}
 
 
-def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path, monkeypatch):
-    monkeypatch.setattr(script, "TILT_LIMIT", 1e-3)
+def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path):
     file = tmp_path / "out.json"
     arguments = ["--fast", "--robot", "doggo", "--bundle", str(doggo_bundle), "--episodes", "2", "--no-pictures"]
+    arguments += ["--set", "guard.tilt_limit=0.001"]
     assert script.main([*arguments, "--out", str(tmp_path / "run"), "--json", str(file)]) == script.FAULT
     episodes = json.loads(file.read_text())["episodes"]
     assert [episode["reason"] for episode in episodes] == ["fault", "fault"]

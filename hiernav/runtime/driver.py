@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,10 @@ from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, Pl
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
 FLUSH_SECONDS = 1.0
 """What observers are given to bring their data to safety once the robot is braked [s]."""
+MAX_SATURATED = 3
+"""Recoveries from a saturated action on the way to one goal."""
+REQUESTS = 16
+"""Commands that are taken in one tick; of more, the oldest are lost. An emergency stop is not among them."""
 
 log = logging.getLogger(__name__)
 
@@ -115,11 +120,13 @@ class Driver:
         self.last_result: RunResult | None = None
         """Of the goal that ended last."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
-        self._requests: deque[Callable[[float], None]] = deque()
+        self._requests: deque[Callable[[float], None]] = deque(maxlen=REQUESTS)
         self._trip: Trip | None = None
         self._ended: Trip | None = None
         self._estimate: Estimate | None = None
         self._paused = self._serving = False
+        self._stop_wanted: str | None = None
+        self._held_since = 0.0
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -165,7 +172,7 @@ class Driver:
 
     def estop(self, why: str = "emergency stop") -> None:
         """Brake, and stay braked until `acknowledge`."""
-        self._requests.append(lambda now: self._estop(why, now))
+        self._stop_wanted = why
 
     def acknowledge(self) -> None:
         """The cause of a fault or of an emergency stop is gone. The robot does not move before it gets a goal."""
@@ -179,6 +186,15 @@ class Driver:
     def goal(self) -> np.ndarray | None:
         """(2,) the present goal, world frame [m]."""
         return None if self._trip is None else self._trip.goal
+
+    def truth(self) -> Truth | None:
+        """What really is, where the robot is a simulated one."""
+        return None if self._truth is None else self._truth()
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The newest."""
+        return self._estimate
 
     def _begin(self) -> None:
         now = self.clock.now()
@@ -233,8 +249,11 @@ class Driver:
         timer.mark("read")
         self._estimate = estimate = self.estimator.update(frame)
         timer.mark("estimate")
-        while self._requests:
+        for _ in range(len(self._requests)):
             self._requests.popleft()(now)
+        if self._stop_wanted is not None:
+            self._estop(self._stop_wanted, now)
+            self._stop_wanted = None
         trust, doubt = self._blind.check(estimate, now)
         late = self._overruns.check(self.loop.overruns_in_a_row)
         occupancy = decision = sent = None
@@ -275,6 +294,7 @@ class Driver:
                 self._end_trip(refusal.code, now, str(refusal))
                 return
             supervisor.change(Mode.ARMED, f"goal {trip.goal[0]:g}, {trip.goal[1]:g}", now)
+            self._held_since = now
         if estimate.restarts != self._restarts:
             self._restarts = estimate.restarts
             self._emit("plan", "the position was found anew: the plan is void", now)
@@ -308,7 +328,7 @@ class Driver:
         """What the robot may do in this tick, `wait` being why it must not move, if so."""
         supervisor = self.supervisor
         if self._paused:
-            wait = "paused"
+            wait, self._held_since = "paused", now
         self._plan_speed = 1.0
         if decision is not None:
             failed = self.pilot.failed
@@ -329,6 +349,8 @@ class Driver:
                 supervisor.change(Mode.RUNNING, "first plan", now)
                 trip.began = stamp
                 self._no_way = BlockedWatch(self.config.no_way_hold, self.config.no_way)
+            elif supervisor.mode is Mode.ARMED and now - self._held_since > self.config.hold_timeout:
+                self._fail(f"armed for {self.config.hold_timeout:g} s: {wait}", now)
             return
         if wait is not None:
             self._hold(trip, wait, now)
@@ -338,11 +360,9 @@ class Driver:
     def _hold(self, trip: Trip, why: str, now: float) -> None:
         if self.supervisor.mode is not Mode.HOLD:
             self.supervisor.change(Mode.HOLD, why, now)
-            trip.holds[why.split(" for ")[0]] += 1
+            trip.holds[re.sub(r" (for )?[0-9].*", "", why)] += 1
             self._held_since = now
             self._standing.begin(now)
-        elif self._paused:
-            self._held_since = now
         elif now - self._held_since > self.config.hold_timeout:
             self._fail(f"held for {self.config.hold_timeout:g} s: {why}", now)
 
@@ -366,8 +386,12 @@ class Driver:
         x, y, _ = estimate.pose.tolist()
         vx, vy = estimate.velocity.tolist()
         if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.proposed):
-            self.pilot.recover()
             self._saturation.reset()
+            self._saturated += 1
+            if self._saturated > MAX_SATURATED:
+                self._fail(f"the action stays saturated, {MAX_SATURATED} recoveries did not help", now)
+                return None, 1.0
+            self.pilot.recover()
         slow = self.guard.config.slow_ttc
         ttc = math.inf
         if slow is not None:
@@ -396,6 +420,7 @@ class Driver:
         self.guard.reset()
         self.pilot.reset()
         self._saturation.reset()
+        self._saturated = 0
 
     def _end_trip(self, reason: str, now: float, detail: str = "") -> None:
         trip, supervisor = self._trip, self.supervisor

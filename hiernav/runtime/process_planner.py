@@ -18,6 +18,8 @@ from hiernav.runtime.pilot import Answer
 from hiernav.runtime.planner_memory import PlannerMemory, Question, Status
 from hiernav.runtime.timing import Histogram
 
+LOADING = 5.0
+"""Time that a planner which has just been started is given to load its network [s]."""
 _REMEMBERED = 256
 
 
@@ -150,11 +152,11 @@ class ProcessPlanner:
             os.close(self._descriptor)
 
     def _watch(self, now: float) -> None:
-        """Have a planner that hangs started again. One that is being started is given three times as long."""
-        if not self._asked:
+        """Have a planner that hangs started again."""
+        if not self._asked or not self.status.starts:  # before the first start the keeper itself is being loaded
             self._silent_since = None
         elif self._silent_since is None:
             self._silent_since = now
-        elif now - self._silent_since > (self.hang_after if self.ready else 3.0 * self.hang_after):
+        elif now - self._silent_since > (self.hang_after if self.ready else LOADING):
             self._silent_since = now
             self._child.nudge(b"r")

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hiernav.nav.occupancy import OccupancyMap, empty_map
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.observation import ObservationLayout, ObservationTerm
+from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
+from hiernav.nav.option import HierarchicalAgent, Planner, TerminationReason, WaypointOption
 from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.delayed_planner import DelayedPlanner
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
-from hiernav.runtime.pilot import Decision
+from hiernav.runtime.pilot import Decision, Pilot
 from hiernav.runtime.robot import SensorFrame
 
 GOAL = np.array([0.98, 0.0])
@@ -32,23 +34,31 @@ class Puck:
     log: list[str] = field(default_factory=list)
     sees: Callable[[SensorFrame], SensorFrame] = lambda frame: frame
     stops: bool = True
+    pinned: bool = False
+    noise: float = 0.0
+    """Of position and velocity [m, m/s]. A robot without any looks frozen while it stands."""
+    sent: list[np.ndarray] = field(default_factory=list)
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def read(self) -> SensorFrame:
         self.log.append("read")
+        error = self.noise * self.rng.standard_normal(4) if self.noise else np.zeros(4)
+        velocity = np.zeros(2) if self.pinned else self.velocity
         return self.sees(
             SensorFrame(
                 stamp=self.stamp,
                 accelerometer=np.array([0.0, 0.0, 9.81]),
                 gyro=np.zeros(3),
                 magnetometer=np.array([0.0, -0.5, 0.0]),
-                velocimeter=np.array([*self.velocity, 0.0]),
+                velocimeter=np.array([*(velocity + error[2:]), 0.0]),
                 lidar=np.zeros(10),
-                position_fix=self.position.copy(),
+                position_fix=self.position + error[:2],
             )
         )
 
     def send(self, action: np.ndarray) -> np.ndarray:
         self.log.append("send")
+        self.sent.append(action)
         self._move(action)
         return action
 
@@ -61,8 +71,9 @@ class Puck:
 
     def _move(self, velocity: np.ndarray) -> None:
         self.velocity = np.array(velocity)
-        self.position = self.position + self.velocity * PERIOD
-        self.stamp += PERIOD
+        if not self.pinned:
+            self.position = self.position + self.velocity * self.control_period
+        self.stamp += self.control_period
 
 
 @dataclass
@@ -124,10 +135,45 @@ class Scripted:
         return decision
 
 
-def driver_of(robot: Puck | None = None, pilot: Scripted | None = None, **settings: object) -> Driver:
+def driver_of(
+    robot: Puck | None = None,
+    pilot: Scripted | Pilot | None = None,
+    occupancy: Callable[[float], OccupancyMap] | None = None,
+    clock: FakeClock | None = None,
+    **settings: object,
+) -> Driver:
     field_map = empty_map((2.0, 2.0))
     settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False)))
-    return Driver(robot or Puck(), pilot or Scripted(), lambda stamp: field_map, FakeClock(), **settings)
+    known = occupancy or (lambda stamp: field_map)
+    return Driver(robot or Puck(), pilot or Scripted(), known, clock or FakeClock(), **settings)  # type: ignore[arg-type]
+
+
+LAYOUT = ObservationLayout((ObservationTerm("waypoints", 20, "m, body frame", 1.0),))
+
+
+def follow(observations: np.ndarray) -> np.ndarray:
+    """A skill for the puck, whose heading is that of the world: towards the seventh waypoint, at up to 0.5 m/s."""
+    ahead = observations[:, 12:14]
+    length = np.linalg.norm(ahead, axis=1, keepdims=True)
+    return (0.5 * ahead / np.maximum(length, 0.2)).astype(np.float32)
+
+
+def pilot_for(
+    planner: Planner, delay: float | None = None, skill: Callable = follow, period: float = PERIOD
+) -> Pilot:
+    """The real agent and the real pilot around `follow`; with a delay, plans are late by it [s]."""
+    link = None if delay is None else DelayedPlanner(planner, delay)
+    option = WaypointOption(link or planner, num_rows=1)
+    return Pilot(HierarchicalAgent(option, skill, LAYOUT, period), link)
+
+
+def map_with(*boxes: tuple[float, float, float, float], half: float = 2.0) -> OccupancyMap:
+    """A square field with boxes x, y, half_x, half_y [m]."""
+    occupancy = empty_map((half, half))
+    occupied = occupancy.occupied.copy()
+    for x, y, half_x, half_y in boxes:
+        draw_boxes(occupied, occupancy.origin, occupancy.resolution, [[x, y]], [[half_x, half_y]])
+    return OccupancyMap(occupied, occupancy.resolution, occupancy.origin)
 
 
 class Listener(Observer):

@@ -1,0 +1,104 @@
+"""What would be driven, and what the host grants: everything is checked, and nothing moves."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hiernav.nav.bundle import Bundle
+from hiernav.runtime.clock import MonotonicClock
+from hiernav.runtime.policy import check_golden, load_policies
+from hiernav.runtime.process_robot import ProcessRobot
+from hiernav.runtime.realtime import request_realtime
+from hiernav.runtime.robot import VECTOR_SENSORS
+from hiernav.runtime.settings import Settings
+from hiernav.runtime.timing import Histogram
+
+WAKES = 200
+PERIOD = 0.005
+
+
+def report(
+    open_bundle: Callable[[], Bundle], make_robot: Callable[[], ProcessRobot], settings: Settings
+) -> dict[str, Any]:
+    """Findings on bundle, robot and host, in JSON's own types; what failed has an "error"."""
+    found: dict[str, Any] = {"bundle": _attempt(lambda: _check_bundle(open_bundle()))}
+    found["robot"] = _attempt(lambda: _check_robot(make_robot()))
+    found["host"] = _check_host(settings)
+    return found
+
+
+def print_report(found: Mapping[str, Any], console: Console | None = None) -> None:
+    """Show a report made by `report`."""
+    console = console or Console()
+    for part, entries in found.items():
+        table = Table(title=part, title_justify="left", show_header=False)
+        for key, value in entries.items():
+            style = "red" if key == "error" or str(value).startswith(("refused", "missing")) else None
+            table.add_row(key, str(value), style=style)
+        console.print(table)
+
+
+def _attempt(check: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return check()
+    except Exception as error:
+        return {"error": f"{' '.join(str(error).split())}"}
+
+
+def _check_bundle(bundle: Bundle) -> dict[str, Any]:
+    policies = load_policies(bundle)
+    manifest = bundle.manifest
+    worst = max(check_golden(bundle, policies).values())
+    return {
+        "robot": manifest.robot,
+        "control period": f"{1e3 * manifest.control_period_s:g} ms",
+        "observation": f"{bundle.layout.size} values: {', '.join(bundle.layout.names)}",
+        "golden values": f"off by {worst:.1g} at most",
+    }
+
+
+def _check_robot(robot: ProcessRobot) -> dict[str, Any]:
+    frame = robot.read()
+    present = [name for name in (*VECTOR_SENSORS, "lidar", "position_fix") if getattr(frame, name) is not None]
+    absent = [name for name in (*VECTOR_SENSORS, "lidar", "position_fix") if name not in present]
+    broken = [name for name in present if not np.isfinite(getattr(frame, name)).all()]
+    return {
+        "control period": f"{1e3 * robot.control_period:g} ms",
+        "actuators": robot.action_dim,
+        "sensors": ", ".join([*present, *frame.extra]) or "missing",
+        "silent": f"missing: {', '.join(absent)}" if absent else "none",
+        "not finite": f"missing: {', '.join(broken)}" if broken else "none",
+        **{f"adapter {name}": text for name, text in robot.realtime.items()},
+    }
+
+
+def _check_host(settings: Settings) -> dict[str, Any]:
+    granted = request_realtime(settings.realtime)
+    clock, lateness = MonotonicClock(), Histogram()
+    start = clock.now()
+    for k in range(1, WAKES + 1):
+        clock.sleep_until(start + k * PERIOD)
+        lateness.record(max(clock.now() - start - k * PERIOD, 0.0))
+    timing = lateness.summary()
+    shown = ", ".join(f"{key} {1e3 * float(timing[key] or 0.0):.2f} ms" for key in ("p50", "p99", "max"))
+    governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, load {os.getloadavg()[0]:.1f}, {platform.release()}",
+        "clock": "absolute sleeps" if clock.absolute else "missing: clock_nanosleep; time.sleep is used",
+        f"lateness of {WAKES} wakes": shown,
+        "CPU governor": governor.read_text().strip() if governor.exists() else "not told by this system",
+        "shared memory": f"{os.statvfs('/dev/shm').f_bavail * os.statvfs('/dev/shm').f_frsize >> 20} MB free"
+        if Path("/dev/shm").exists()
+        else "not told by this system",
+        "wall clock": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
+        **granted,
+    }

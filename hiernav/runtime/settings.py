@@ -1,0 +1,102 @@
+"""Settings of the runtime: one section per concern, from a YAML file and `section.key=value` on the command line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hiernav.decode import ConfigError, parse_yaml
+from hiernav.runtime.driver import DriverConfig
+from hiernav.runtime.estimate import EstimatorConfig
+from hiernav.runtime.guard import GuardConfig
+from hiernav.runtime.noise import SensorNoise
+from hiernav.runtime.realtime import RealtimeConfig
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What may differ from robot to robot and from host to host. What the networks depend on is in their bundle."""
+
+    driver: DriverConfig = field(default_factory=DriverConfig)
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+    guard: GuardConfig = field(default_factory=GuardConfig)
+    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    """Of simulated sensors."""
+
+
+_SECTIONS: dict[str, Any] = {
+    "driver": DriverConfig,
+    "estimator": EstimatorConfig,
+    "guard": GuardConfig,
+    "realtime": RealtimeConfig,
+    "noise": SensorNoise,
+}
+
+
+def load_settings(
+    path: Path | None = None,
+    overrides: Sequence[str] = (),
+    defaults: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Settings:
+    """Defaults, then the file, then `section.key=value` overrides.
+
+    Args:
+        path: YAML file with some of the sections.
+        overrides: as on the command line.
+        defaults: values by section and key that the robot itself asks for.
+
+    Raises:
+        ConfigError: the file cannot be read, or a section, key or value is not one that `Settings` takes.
+    """
+    values = {name: dict(section) for name, section in (defaults or {}).items()}
+    if path is not None:
+        for name, section in _read(path).items():
+            _known(name, list(_SECTIONS), str(path))
+            if not isinstance(section, dict):
+                raise ConfigError(f"{path}: {name} must be a section with settings, it is {section!r}")
+            values.setdefault(name, {}).update(section)
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        name, dot, leaf = key.partition(".")
+        if not (equals and dot):
+            raise ConfigError(f"command line: {override!r}, expected section.key=value")
+        _known(name, list(_SECTIONS), "command line")
+        values.setdefault(name, {})[leaf] = parse_yaml(text, f"command line: {key}")
+    source = "settings" if path is None else str(path)
+    return Settings(**{name: _section(name, section, source) for name, section in values.items()})
+
+
+def _section(name: str, values: Mapping[str, Any], source: str) -> Any:
+    kind = _SECTIONS[name]
+    for key in values:
+        _known(key, [each.name for each in fields(kind)], f"{source}: {name}")
+    try:
+        return msgspec.convert(dict(values), kind)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise ConfigError(f"{source}: {name}: {error}") from None
+
+
+def _known(key: str, known: list[str], where: str) -> None:
+    if key in known:
+        return
+    near = difflib.get_close_matches(str(key), known, 1)
+    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+    raise ConfigError(f"{where}: unknown setting {key!r}; {hint}")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = parse_yaml(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected sections with settings")
+    return values

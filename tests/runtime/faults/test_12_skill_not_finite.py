@@ -1,0 +1,41 @@
+"""A skill that gives NaN or inf: the tick is braked, three in a row are a fault."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from puck import GOAL, Listener, Puck, driver_of, follow, pilot_for
+
+from hiernav.nav.planners import StraightPlanner
+
+
+def spoilt(value: float, ticks: set[int]):
+    calls = iter(range(10**9))
+
+    def skill(observations: np.ndarray) -> np.ndarray:
+        action = follow(observations)
+        if next(calls) in ticks:
+            action[0, 1] = value
+        return action
+
+    return skill
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_two_bad_actions_are_braked_and_driven_on(value):
+    robot = Puck(noise=1e-3)
+    result = driver_of(robot, pilot_for(StraightPlanner(), skill=spoilt(value, {3, 4}))).run(GOAL)
+    assert result.reached and result.guard["non_finite"] == 2
+    assert [k for k, action in enumerate(robot.sent) if not action.any()] == [3, 4]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_the_third_is_a_fault_in_its_own_tick(value):
+    robot, seen = Puck(noise=1e-3), Listener()
+    driver = driver_of(robot, pilot_for(StraightPlanner(), skill=spoilt(value, {3, 4, 5})), observers=[seen])
+    result = driver.run(GOAL)
+    assert result.reason == "fault" and "action not finite 3 times in a row, first in channel 1" in result.fault
+    assert seen.records[-1].index == 5 and seen.records[-1].sent is None
+    assert np.isfinite(robot.sent).all()

@@ -1,0 +1,81 @@
+"""SIGTERM, and SIGINT twice: the brake at once, what was observed brought to safety within a second, exit code 0."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from shipped import RUN_LOOP
+
+PROGRAM = textwrap.dedent(
+    """
+    import sys, time
+    sys.path.insert(0, {tests!r})
+    import numpy as np
+    from puck import Puck, driver_of
+    from hiernav.runtime.clock import MonotonicClock
+    from hiernav.runtime.observe import Observer
+
+    class Robot(Puck):
+        told = False
+
+        def brake(self):
+            if self.sent and not self.told:
+                self.told = True
+                print("brake", time.monotonic(), flush=True)
+            super().brake()
+
+    class Saver(Observer):
+        def tick(self, record):
+            if record.index == 20:
+                print("driving", time.monotonic(), flush=True)
+        def flush(self, timeout):
+            print("flush", time.monotonic(), flush=True)
+
+    robot = Robot(control_period=0.02, noise=1e-3)
+    driver = driver_of(robot, clock=MonotonicClock(), observers=[Saver()])
+    result = driver.run(np.array([1.9, 1.9]), max_steps=100000)
+    print("ended", result.reason, result.stopped, robot.log[-1], flush=True)
+    """
+)
+
+
+@pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT], [signal.SIGINT, signal.SIGINT]])
+def test_a_signal_brakes_and_saves_before_anything_else(signals):
+    program = PROGRAM.format(tests=str(Path(__file__).parents[1]))
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("driving")
+    sent = time.monotonic()
+    for number in signals:
+        process.send_signal(number)
+    lines = process.communicate(timeout=60)[0].splitlines()
+    assert process.returncode == 0
+    assert [line.split()[0] for line in lines] == ["brake", "flush", "ended"]
+    assert lines[-1].split()[1] == "interrupted"
+    assert float(lines[1].split()[1]) - sent < 1.0
+    if len(signals) == 1:
+        assert lines[-1].split()[2] == "True"  # a second signal may cut the verification of the stop short
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
+    out = tmp_path / "out"
+    command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
+    process = subprocess.Popen(
+        [*command, "--planner", "sync", "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert "ready for goals" in process.stdout.readline()
+    time.sleep(0.2)
+    process.send_signal(number)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert json.loads((out / "summary.json").read_text())["timing"]["ticks"] > 0

@@ -1,0 +1,91 @@
+"""The control process is killed or stopped: the adapter in its own process brakes the robot."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from hiernav.runtime.robot import CommandWatchdog
+
+ROBOT = Path(__file__).parents[1] / "scripted_robot.py"
+CONTROL = textwrap.dedent(
+    """
+    import sys, time
+    import numpy as np
+    from hiernav.runtime.process_robot import ProcessRobot
+    robot = ProcessRobot({robot!r} + ":make", {{"path": {path!r}}})
+    robot.read()
+    print(robot.child.process.pid, flush=True)
+    at = time.monotonic()
+    while True:
+        robot.send(np.array([1.0, 0.0]))
+        at += robot.control_period
+        time.sleep(max(at - time.monotonic(), 0.0))
+    """
+)
+
+
+def test_the_watchdog_expires_50_ms_after_the_last_command():
+    watchdog = CommandWatchdog(0.02)
+    watchdog.feed(1.0)
+    assert not watchdog.expired(1.0499) and watchdog.expired(1.0501)
+    assert CommandWatchdog(0.04).timeout == pytest.approx(0.06)  # one period and a half, where that is longer
+
+
+def watch(tmp_path: Path, number: signal.Signals) -> list[tuple[str, float]]:
+    """What the adapter did with its robot, its control process being sent a signal after a moment."""
+    path = tmp_path / "robot.log"
+    path.touch()
+    program = CONTROL.format(robot=str(ROBOT), path=str(path))
+    control = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert control.stdout is not None
+    adapter = int(control.stdout.readline())
+    try:
+        _wait_for(lambda: path.read_text().count("send") > 20)
+        control.send_signal(number)
+        _wait_for(lambda: "brake" in path.read_text().partition("send")[2].rpartition("send")[2])
+        if number is signal.SIGKILL:
+            _wait_for(lambda: path.read_text().endswith("\n") and "close" in path.read_text())
+    finally:
+        control.kill()
+        control.wait()
+    _wait_for(lambda: not os.path.exists(f"/proc/{adapter}") or _zombie(adapter))
+    done = [line.split() for line in path.read_text().splitlines()]
+    return [(what, float(at)) for what, at in done]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_adapter_brakes_by_itself_and_ends_with_the_control_process(tmp_path, number):
+    done = watch(tmp_path, number)
+    last = max(k for k, (what, _) in enumerate(done) if what == "send")
+    assert done[last + 1][0] == "brake"
+    assert done[-1][0] == "close"
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_it_does_so_within_50_ms(tmp_path, number):
+    done = watch(tmp_path, number)
+    last = max(k for k, (what, _) in enumerate(done) if what == "send")
+    assert done[last + 1][1] - done[last][1] <= 0.055  # and what the adapter takes to wake up
+
+
+def _wait_for(condition, patience: float = 30.0) -> None:
+    end = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def _zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True

@@ -1,0 +1,77 @@
+"""A robot that is held fast: three recoveries, bounded in time and distance, then a fault."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from puck import Listener, Puck, driver_of, pilot_for
+
+from hiernav.nav.planners import StraightPlanner
+from hiernav.nav.recovery import Recovery
+from hiernav.runtime.supervisor import Mode
+
+PERIOD, GOAL = 0.02, np.array([1.5, 0.0])
+
+
+def drive(robot: Puck) -> tuple[Listener, object]:
+    seen = Listener()
+    return seen, driver_of(robot, pilot_for(StraightPlanner(), period=PERIOD), observers=[seen]).run(GOAL, 5000)
+
+
+def test_a_pinned_robot_is_a_fault_after_three_bounded_recoveries():
+    seen, result = drive(Puck(control_period=PERIOD, noise=1e-3, pinned=True))
+    assert result.reason == "fault" and "stuck: 3 recoveries did not help" in result.fault
+    assert result.recoveries == 3
+    backing = [record for record in seen.records if record.mode is Mode.RECOVERING]
+    assert len(backing) == 3 * round(0.4 / PERIOD)
+    assert all((record.sent == -record.proposed).all() for record in backing)
+
+
+def test_each_recovery_is_followed_by_a_new_plan():
+    seen, _ = drive(Puck(control_period=PERIOD, noise=1e-3, pinned=True))
+    modes = [record.mode for record in seen.records]
+    ends = [k for k in range(1, len(modes)) if modes[k - 1] is Mode.RECOVERING and modes[k] is Mode.RUNNING]
+    assert len(ends) == 3
+    assert all(any(seen.records[k + j].replanned for j in (0, 1, 2)) for k in ends)
+
+
+def test_a_robot_that_gets_free_goes_on():
+    robot = Puck(control_period=PERIOD, noise=1e-3, pinned=True)
+    sends = robot._move
+
+    def move(velocity: np.ndarray) -> None:
+        robot.pinned = robot.pinned and robot.stamp < 2.0
+        sends(velocity)
+
+    robot._move = move
+    _, result = drive(robot)
+    assert result.reached and 1 <= result.recoveries <= 3
+
+
+def test_backing_ends_after_half_a_metre_however_fast():
+    recovery = Recovery(1, 0.1, duration_s=10.0)
+    position, moved = np.zeros((1, 2)), []
+    for _ in range(40):
+        action = recovery(position, np.full((1, 10, 2), 9.0), np.ones((1, 1)))
+        if action[0, 0] < 0:
+            position = position - [[0.12, 0.0]]
+        moved.append(position[0, 0])
+    assert -0.75 <= min(moved) <= -0.5
+
+
+@pytest.mark.parametrize("seconds", [1.0])
+def test_waiting_is_not_being_stuck(seconds):
+    robot = Puck(control_period=PERIOD, noise=1e-3)
+    driver = driver_of(robot, pilot_for(StraightPlanner(), period=PERIOD))
+    inner = driver._step
+
+    def step(now: float) -> None:
+        if round(now / PERIOD) == 40:
+            driver.pause()
+        if round(now / PERIOD) == 40 + round(5.0 / PERIOD):
+            driver.resume()
+        inner(now)
+
+    driver._step = step
+    result = driver.run(GOAL)
+    assert result.reached and result.recoveries == 0 and result.holds == {"paused": 1}
