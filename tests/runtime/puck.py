@@ -158,9 +158,7 @@ def follow(observations: np.ndarray) -> np.ndarray:
     return (0.5 * ahead / np.maximum(length, 0.2)).astype(np.float32)
 
 
-def pilot_for(
-    planner: Planner, delay: float | None = None, skill: Callable = follow, period: float = PERIOD
-) -> Pilot:
+def pilot_for(planner: Planner, delay: float | None = None, skill: Callable = follow, period: float = PERIOD) -> Pilot:
     """The real agent and the real pilot around `follow`; with a delay, plans are late by it [s]."""
     link = None if delay is None else DelayedPlanner(planner, delay)
     option = WaypointOption(link or planner, num_rows=1)

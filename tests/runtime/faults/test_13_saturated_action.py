@@ -26,7 +26,9 @@ def drive(share: float, lasting: float, turning: float) -> tuple[Listener, objec
 
     seen = Listener()
     pilot = pilot_for(StraightPlanner(), skill=skill, period=PERIOD)
-    driver = driver_of(Puck(noise=1e-3, control_period=PERIOD, position=np.array([-1.0, -1.0])), pilot, observers=[seen])
+    driver = driver_of(
+        Puck(noise=1e-3, control_period=PERIOD, position=np.array([-1.0, -1.0])), pilot, observers=[seen]
+    )
     return seen, driver.run(FAR, max_steps=3000)
 
 

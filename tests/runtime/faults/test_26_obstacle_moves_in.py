@@ -15,7 +15,7 @@ PILLAR = map_with((0.8, 0.0, 0.15, 0.15))
 GATE = map_with((0.8, 0.0, 0.15, 2.0))
 
 
-def drive(blocked, begins: float, ends: float, skill_stops: bool = True):
+def drive(blocked, begins: float, ends: float):
     seen, robot = Listener(), Puck(control_period=PERIOD, noise=1e-3, position=np.array([-1.0, 0.0]))
     pilot = pilot_for(VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(), 0.1), period=PERIOD)
     driver = driver_of(
@@ -43,7 +43,6 @@ def test_an_obstacle_with_a_way_around_is_driven_around():
 def test_a_closed_way_is_waited_at_with_a_margin_and_driven_on_when_it_opens():
     seen, robot, result = drive(GATE, 1.5, 5.5)
     assert result.reached and result.holds == {"no way to the goal": 1}
-    assert result.guard["slowed"] > 0 or clearances(seen, GATE).min() > 0.5
     assert clearances(seen, GATE).min() > 0.1
     held = [record for record in seen.records if record.mode is Mode.HOLD]
     assert held and all(record.sent is None for record in held)
@@ -52,7 +51,7 @@ def test_a_closed_way_is_waited_at_with_a_margin_and_driven_on_when_it_opens():
 
 def test_a_way_that_stays_closed_is_given_up():
     _, robot, result = drive(GATE, 1.5, 1e9)
-    assert (result.reason, result.stopped) == ("unreachable", True) or "no way to the goal" in (result.fault or "")
+    assert (result.reason, result.stopped) == ("unreachable", True)
 
 
 def test_just_before_an_obstacle_the_robot_is_slowed_down_in_proportion():

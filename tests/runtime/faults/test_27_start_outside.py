@@ -19,7 +19,8 @@ def drive(position):
 
 
 @pytest.mark.parametrize(
-    ("position", "code"), [([3.0, 0.0], "start_outside"), ([0.0, -2.2], "start_outside"), ([1.0, 0.0], "start_occupied")]
+    ("position", "code"),
+    [([3.0, 0.0], "start_outside"), ([0.0, -2.2], "start_outside"), ([1.0, 0.0], "start_occupied")],
 )
 def test_it_is_refused_by_code_and_nothing_moves(position, code):
     robot, result = drive(position)
