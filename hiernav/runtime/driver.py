@@ -342,7 +342,7 @@ class Driver:
                 self._end_trip("unreachable", now, "the planner finds no way to the goal")
                 return
             if decision.given_up and supervisor.driving:
-                self._fail(f"stuck: {self.pilot.recoveries} recoveries did not help", now)
+                self._fail("stuck: recoveries in this place did not help", now)
                 return
         if supervisor.mode in (Mode.INIT, Mode.READY, Mode.ARMED):
             if supervisor.mode is Mode.ARMED and decision is not None and wait is None:

@@ -1,4 +1,4 @@
-"""A machine that stalls or is overloaded: deadlines are skipped, not caught up; three overruns in a row are waited out."""
+"""A machine that stalls or is overloaded: deadlines are skipped, not caught up; three in a row are waited out."""
 
 from __future__ import annotations
 

@@ -19,11 +19,11 @@ def drive(robot: Puck) -> tuple[Listener, object]:
 
 def test_a_pinned_robot_is_a_fault_after_three_bounded_recoveries():
     seen, result = drive(Puck(control_period=PERIOD, noise=1e-3, pinned=True))
-    assert result.reason == "fault" and "stuck: 3 recoveries did not help" in result.fault
+    assert result.reason == "fault" and "stuck: recoveries in this place did not help" in result.fault
     assert result.recoveries == 3
     backing = [record for record in seen.records if record.mode is Mode.RECOVERING]
-    assert len(backing) == 3 * round(0.4 / PERIOD)
-    assert all((record.sent == -record.proposed).all() for record in backing)
+    assert len(backing) == 3 * round(0.6 / PERIOD)
+    assert np.mean([record.sent[0] * record.proposed[0] for record in backing]) < 0.0
 
 
 def test_each_recovery_is_followed_by_a_new_plan():
@@ -48,7 +48,7 @@ def test_a_robot_that_gets_free_goes_on():
 
 
 def test_backing_ends_after_half_a_metre_however_fast():
-    recovery = Recovery(1, 0.1, duration_s=10.0, limit=1)
+    recovery = Recovery(1, 0.1, duration_s=10.0, limit=1, shake=0.0)
     position, moved = np.zeros((1, 2)), []
     for _ in range(30):
         action = recovery(position, np.full((1, 10, 2), 9.0), np.ones((1, 1)))
