@@ -79,7 +79,7 @@ def bench_peers(arguments: argparse.Namespace) -> dict[str, Any]:
         return int(count), float(spent)
 
     try:
-        rates = typical(race({name: partial(turn, worker) for name, worker in workers.items()}, arguments.seconds))
+        rates = typical(race({name: partial(turn, worker) for name, worker in workers.items()}, arguments.seconds, 0.5))
     finally:
         for worker in workers.values():
             worker.stdin.close()  # type: ignore[union-attr]

@@ -65,7 +65,8 @@ class DirectSACLoss(SACLoss):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of SACLoss, to be differentiated by autograd."""
-        out, gradients, actor = self.differentiate(tensordict), self.weights.grad.clone(), self._sizes[0]
+        out = {name: value.clone() for name, value in self.differentiate(tensordict).items()}
+        gradients, actor = self.weights.grad.clone(), self._sizes[0]
         zeros, start = {"loss_actor": 0.0, "loss_qvalue": 0.0}, 0
         for parameter in self._learning:
             gradient = gradients[start : start + parameter.numel()].view(parameter.shape)
@@ -76,7 +77,7 @@ class DirectSACLoss(SACLoss):
         out["loss_alpha"] = -self.log_alpha * (self.target_entropy - out["entropy"])
         return TensorDict(out, [])
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def differentiate(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Losses and what else SACLoss reports for a batch (B,) of transitions, without autograd.
 
