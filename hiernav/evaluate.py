@@ -19,7 +19,7 @@ import numpy as np
 from hiernav.config import OptionConfig, PlannerConfig, SkillConfig, TrainConfig
 from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
 from hiernav.nav.option import Planner, Skill, TerminationReason
-from hiernav.nav.planners import GoseloPlanner, Network, VerifiedPlanner
+from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
 from hiernav.runtime.policy import load_policies
 from hiernav.sim.factory import default_planner, expert_planner, make_task, skill_layout
 from hiernav.sim.layout import WorldSpec
@@ -73,8 +73,8 @@ def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:
         raise ValueError(f"unknown planner {kind!r}; known: cnn, astar")
     if policies.network is None:
         raise ValueError("these policies hold no planner network: train the planner first, or use --planner astar")
-    proposer = GoseloPlanner(policies.network, policies.channels, expert.radius, expert.soft_margin)
-    return VerifiedPlanner(proposer, expert, get_robot(policies.config.robot).radius) if repair else proposer
+    planner = verified_planner(policies.network, policies.channels, expert, get_robot(policies.config.robot).radius)
+    return planner if repair else planner.planner
 
 
 def evaluate(

@@ -223,3 +223,10 @@ def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMa
     leaving = np.arange(clearance.shape[1]) * spacing < 0.15
     excused = leaving & (np.diff(clearance, axis=1, prepend=escape) >= -1e-6) & (clearance >= escape - 1e-6)
     return np.where(finite, np.where(excused, np.inf, clearance).min(axis=1, initial=np.inf), np.nan)
+
+
+def verified_planner(
+    network: Network, channels: tuple[str, ...], expert: ShortestPathPlanner, robot_radius: float
+) -> VerifiedPlanner:
+    """A network's plans as robots drive them: checked for a disc of `robot_radius` [m], repaired by the expert."""
+    return VerifiedPlanner(GoseloPlanner(network, channels, expert.radius, expert.soft_margin), expert, robot_radius)

@@ -124,16 +124,13 @@ def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: floa
         network: of that bundle.
         robot_radius: disc with which plans are swept against the map [m].
     """
-    from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner  # takes scipy along
+    from hiernav.nav.planners import ShortestPathPlanner, verified_planner  # takes scipy along
 
     plan = bundle.manifest.plan
-    return VerifiedPlanner(
-        GoseloPlanner(network, bundle.manifest.goselo.channels, plan.planning_radius_m, plan.soft_margin_m),
-        ShortestPathPlanner(
-            plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
-        ),
-        robot_radius,
+    expert = ShortestPathPlanner(
+        plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
     )
+    return verified_planner(network, bundle.manifest.goselo.channels, expert, robot_radius)
 
 
 def make_agent(
