@@ -335,8 +335,8 @@ class AgentStep:
 
     action: np.ndarray
     """(N, A) float32 in [-1, 1]."""
-    proposed: np.ndarray
-    """(N, A) float32 what the skill said, before any recovery."""
+    plan: np.ndarray
+    """(N, K, 2) what the skill follows, world frame [m]: the option's plan, or a way out (`Recovery`)."""
     observation: np.ndarray
     """(N, D) float32."""
     option: OptionStep
@@ -344,10 +344,6 @@ class AgentStep:
     @property
     def reason(self) -> np.ndarray:
         return self.option.reason
-
-    @property
-    def plan(self) -> np.ndarray:
-        return self.option.plan
 
     @property
     def start(self) -> np.ndarray:
@@ -374,7 +370,7 @@ class HierarchicalAgent:
     """Time between two calls of `act` [s]."""
 
     def __post_init__(self) -> None:
-        self.recovery = Recovery(self.option.num_rows, self.control_period)
+        self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
 
     def reset(self, rows: np.ndarray | None = None) -> None:
@@ -399,11 +395,10 @@ class HierarchicalAgent:
             occupancy: N maps as they are now.
         """
         step = self.option.step(pose[:, :2], goal, occupancy)
-        observation = self.layout.build(guided(terms, pose, step.plan, goal, self._steps * self.control_period))
+        plan = self.recovery(pose, step.plan, occupancy)
+        observation = self.layout.build(guided(terms, pose, plan, goal, self._steps * self.control_period))
         self._steps += 1
-        proposed = self.skill(observation)
-        action = self.recovery(pose[:, :2], step.plan, proposed)
-        return AgentStep(action, proposed, observation, step)
+        return AgentStep(self.skill(observation), plan, observation, step)
 
 
 def guided(

@@ -385,7 +385,7 @@ class Driver:
         """Past the guard to the robot; what was sent, None if the robot is to be braked, and how it was slowed."""
         x, y, _ = estimate.pose.tolist()
         vx, vy = estimate.velocity.tolist()
-        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.proposed):
+        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.action):
             self._saturation.reset()
             self._saturated += 1
             if self._saturated > MAX_SATURATED:
@@ -487,7 +487,7 @@ class Driver:
                 "reason": decision.reason,
                 "replanned": decision.replanned,
                 "observation": decision.observation,
-                "proposed": decision.proposed,
+                "proposed": decision.action,
             }
         record = TickRecord(
             index=self.loop.ticks - self._loop_ticks - 1,

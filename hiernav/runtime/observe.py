@@ -61,7 +61,7 @@ class TickRecord:
     proposed: np.ndarray | None = None
     """(A,) float32, what the skill said."""
     sent: np.ndarray | None = None
-    """(A,) what the robot was really sent, after recovery and guard; None if it was braked."""
+    """(A,) what the robot was really sent, after the guard; None if it was braked."""
     speed_scale: float = 1.0
     """Factor by which the guard slowed the robot down."""
     timings: Mapping[str, float] = field(default_factory=dict)

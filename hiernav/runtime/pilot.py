@@ -57,15 +57,13 @@ class Decision:
     """What is to be done in one tick, and why."""
 
     action: np.ndarray
-    """(A,) float32, recovery included."""
-    proposed: np.ndarray
     """(A,) float32, what the skill said."""
     observation: np.ndarray
     """(D,) float32."""
     reason: TerminationReason
     """Why the plan ended in this tick."""
     plan: np.ndarray
-    """(K, 2) world frame [m]."""
+    """(K, 2) that the skill follows, world frame [m]."""
     start: np.ndarray
     """(2,) position it was made from [m]."""
     plan_stamp: float | None
@@ -220,7 +218,6 @@ class Pilot:
             self._asked_at = now
         return Decision(
             action=step.action[0],
-            proposed=step.proposed[0],
             observation=step.observation[0],
             reason=TerminationReason(int(step.reason[0])),
             plan=step.plan[0],

@@ -8,14 +8,15 @@ what differs first is where a difference comes from.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hiernav.nav.bundle import Bundle
-from hiernav.nav.occupancy import VisitMap
+from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
+from hiernav.nav.recovery import Recovery
 from hiernav.runtime.about import About
 from hiernav.runtime.estimate import Estimate
 from hiernav.runtime.estimator import Estimator
@@ -92,6 +93,7 @@ class Replay:
         self._planner = make_planner(bundle, load_policies(bundle).planner, about.robot_radius)
         self._asked = _Asked() if about.planner_process else None
         self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked)
+        self._agent.recovery = self._recovery = _Recorded(1, self._agent.control_period)
         self._estimator = Estimator(about.estimator)
         self._guard = Guard(bundle.golden["action"].shape[1], about.guard)
         self._mode = Mode.INIT
@@ -162,9 +164,8 @@ class Replay:
         if tick.observation is not None:
             yield from self._decision(tick)
         if tick.sent is not None and tick.proposed is not None:
-            action = -tick.proposed if tick.mode is Mode.RECOVERING else tick.proposed
             upright = None if tick.estimate is None else tick.estimate.upright
-            yield "sent", tick.sent, self._guard.check(action, upright, speed=tick.speed_scale).action
+            yield "sent", tick.sent, self._guard.check(tick.proposed, upright, speed=tick.speed_scale).action
         if self._waits:
             # as after a recovery: another plan is asked for at the next tick
             self._agent.option.waiting[0], self._waits = True, False
@@ -177,11 +178,12 @@ class Replay:
             if tick.replanned:
                 yield from self._answer(tick, self._asked)
         terms = self._terms.fill(tick.frame)
+        self._recovery.plan = tick.plan if tick.mode is Mode.RECOVERING else None
         step = self._agent.act(tick.estimate.pose[None], terms, tick.goal[None], (tick.occupancy,))
         yield "reason", int(tick.reason), int(step.reason[0])
         yield "plan", tick.plan, step.plan[0]
         yield "observation", tick.observation, step.observation[0]
-        yield "proposed", tick.proposed, step.proposed[0]
+        yield "proposed", tick.proposed, step.action[0]
 
     def _answer(self, tick: TickRecord, asked: _Asked) -> Iterator[tuple[str, object, object]]:
         """A plan arrived that was asked for earlier: plan again from the state it was made from, then follow it."""
@@ -189,8 +191,22 @@ class Replay:
         if query is None or tick.plan is None or tick.plan_start is None:
             yield "plan", tick.plan, None
             return
-        yield "plan", tick.plan, np.asarray(self._planner.plan(query), dtype=np.float64)[0]
-        self._agent.option.adopt(0, tick.plan, tick.plan_start, query.occupancy[0])
+        plan = np.asarray(self._planner.plan(query), dtype=np.float64)[0]
+        if tick.mode is not Mode.RECOVERING:
+            yield "plan", tick.plan, plan
+            plan = tick.plan
+        self._agent.option.adopt(0, plan, tick.plan_start, query.occupancy[0])
+
+
+class _Recorded(Recovery):
+    """In the place of the recovery, which hangs on more than was recorded: gives what it gave."""
+
+    plan: np.ndarray | None = None
+
+    def __call__(
+        self, pose: np.ndarray, plan: np.ndarray, occupancy: Sequence[OccupancyMap], rows: np.ndarray | None = None
+    ) -> np.ndarray:
+        return plan if self.plan is None else self.plan[None]
 
 
 class _Asked(Planner):

@@ -68,7 +68,7 @@ def run_episodes(
         skill: observations (N, D) -> actions (N, A).
         on_episode: called with the index of the layout and the episode, in the order in which they end.
         on_step: called after every control step, before `on_episode` and before rows that ended start anew.
-        recover: whether a robot that stands still backs out, as it does when deployed (`Recovery`).
+        recover: whether a robot that stands still gets a way out, as it does when deployed (`Recovery`).
     """
     if not layouts:
         return []
@@ -77,17 +77,19 @@ def run_episodes(
     current = np.full(task.num_rows, -1)
     current[:rows] = np.arange(rows)
     waiting = rows
+    guided = "waypoints" in task.layout.names
+    task.recovery = (
+        Recovery(task.num_rows, task.robot.control_period, task.robot.radius) if recover and guided else None
+    )
     # rows without an episode of their own repeat one and are not looked at
     task.reset(layouts=[layouts[row % rows] for row in range(task.num_rows)])
     driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))
     collisions = np.zeros(task.num_rows, dtype=np.int64)
-    recovery = Recovery(task.num_rows, task.robot.control_period)
     while (current >= 0).any():
         idle = current < 0
         task.goal[idle] = task.pose[idle, :2]  # where it is: a robot at its goal asks for no plans
         before = task.pose[:, :2]
-        action = skill(task.observation)
-        step = task.step(recovery(before, task.option.plan, action) if recover else action)
+        step = task.step(skill(task.observation))
         driven += np.linalg.norm(task.pose[:, :2] - before, axis=-1)
         earned += step.reward
         collisions += step.collided
@@ -112,7 +114,7 @@ def run_episodes(
                 shortest_length=shortest_length(layout, task.robot.radius),
                 replans={r.name.lower(): int(counts[r]) for r in TerminationReason if r != TerminationReason.NONE},
                 refused=int(task.option.refused[row]),
-                recoveries=int(recovery.counts[row]),
+                recoveries=0 if task.recovery is None else int(task.recovery.counts[row]),
                 plan_seconds=float(planned[row]),
             )
             results[current[row]] = episode
@@ -126,7 +128,6 @@ def run_episodes(
         task.reset(again, [layouts[index] for index in following.tolist()])
         for values in (driven, earned, planned, collisions):
             values[ended] = 0
-        recovery.reset(ended)
     return [episode for episode in results if episode is not None]
 
 

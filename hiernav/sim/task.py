@@ -16,6 +16,7 @@ from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import OptionStep, WaypointOption, guided
+from hiernav.nav.recovery import Recovery
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, inside
 from hiernav.sim.reward import reward_terms, weighted_sum
@@ -88,6 +89,8 @@ class NavigationTask:
         self.reward = reward or RewardConfig()
         self.sim = BatchSim(robot, self.num_rows, scene_for(worlds), threads)
         self.end_on_fall = end_on_fall
+        self.recovery: Recovery | None = None
+        """Ways out for robots that are stuck; none in training."""
         self._cap = np.iinfo(np.int64).max if max_steps is None else max_steps
         self._draw = layouts
         self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
@@ -129,6 +132,8 @@ class NavigationTask:
             self._set_points(row, layout.obstacle_points(0.0))
         self.steps[rows] = 0
         self.option.reset(rows)
+        if self.recovery is not None:
+            self.recovery.reset(rows)
         self._observe(rows)
         return self.observation
 
@@ -173,8 +178,9 @@ class NavigationTask:
         pick = slice(None) if rows is None else rows  # of all rows no copy is made
         pose, goal = self.sim.pose[pick], self.goal[pick]
         option = self.option.step(pose[:, :2], goal, maps, rows)
+        plan = option.plan if self.recovery is None else self.recovery(pose, option.plan, maps, rows)
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
-        values = guided(sensors, pose, option.plan, goal, self.steps[pick] * self.robot.control_period)
+        values = guided(sensors, pose, plan, goal, self.steps[pick] * self.robot.control_period)
         values["lidar"] = lidar_closeness(pose, self._points[pick])
         built = self.layout.build(values)
         if not np.isfinite(built).all():

@@ -3,99 +3,131 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.testing import assert_array_equal
+import pytest
+from numpy.testing import assert_allclose
 
-from hiernav.nav.recovery import Recovery
+from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
+from hiernav.nav.recovery import Recovery, way_out
 
 PERIOD = 0.1
-WINDOW, DURATION = 15, 6
-AHEAD = np.broadcast_to([1.0, 0.0], (1, 10, 2))
-PUSH = np.array([[0.5, -0.3]])
-
-
-def reversing(rows: int) -> Recovery:
-    """A recovery that only reverses."""
-    return Recovery(rows, PERIOD, shake=0.0)
+WINDOW, DURATION = 15, 10
+AHEAD = 0.1 * np.arange(1, 11)[None, :, None] * [1.0, 0.0]
+FAR = AHEAD + [9.0, 0.0]
+FREE = empty_map((3.0, 3.0))
 
 
 def drive(recovery: Recovery, positions: np.ndarray, plan: np.ndarray = AHEAD) -> list[bool]:
-    """Whether the action was reversed, at each of the positions (T, 2)."""
-    actions = [recovery(position[None], plan, PUSH) for position in np.asarray(positions, dtype=float)]
-    for action in actions:
-        assert_array_equal(np.abs(action), np.abs(PUSH))
-    return [bool(action[0, 0] < 0) for action in actions]
+    """Whether the robot, which looks along +x, was given a way out at each of the positions (T, 2)."""
+    poses = np.column_stack([np.asarray(positions, dtype=float), np.zeros(len(positions))])
+    return [recovery(pose[None], plan, [FREE]) is not plan for pose in poses]
 
 
-def test_a_robot_that_stands_reverses_for_a_moment_and_is_then_watched_anew() -> None:
-    recovery = reversing(1)
-    reversed_ = drive(recovery, np.zeros((2 * (WINDOW + 1), 2)))
-    begins = [t for t in range(1, len(reversed_)) if reversed_[t] and not reversed_[t - 1]]
+def test_a_robot_that_stands_gets_a_way_out_for_a_moment_and_is_then_watched_anew() -> None:
+    recovery = Recovery(1, PERIOD)
+    helped = drive(recovery, np.zeros((2 * (WINDOW + 1) + 10, 2)))
+    begins = [t for t in range(1, len(helped)) if helped[t] and not helped[t - 1]]
     assert begins == [WINDOW, 2 * WINDOW + 1]
-    assert sum(reversed_[: WINDOW + 10]) == DURATION
+    assert sum(helped[: WINDOW + 12]) == DURATION
     assert recovery.counts.tolist() == [2]
 
 
+def test_half_a_metre_away_the_plan_is_followed_again() -> None:
+    recovery = Recovery(1, PERIOD)
+    assert drive(recovery, np.zeros((WINDOW + 1, 2)))[-1]
+    assert drive(recovery, np.array([[0.3, 0.0], [0.6, 0.0]])) == [True, False]
+
+
 def test_a_robot_on_its_way_is_left_alone() -> None:
-    recovery = reversing(1)
+    recovery = Recovery(1, PERIOD)
     along = np.stack([0.004 * np.arange(200), np.zeros(200)], axis=1)
-    assert not any(drive(recovery, along, AHEAD + [9.0, 0.0]))
-    assert any(drive(recovery, 0.5 * along, AHEAD + [9.0, 0.0])), "half as fast it covers 3 cm in the window"
+    assert not any(drive(recovery, along, FAR))
+    assert any(drive(recovery, 0.5 * along, FAR)), "half as fast it covers 3 cm in the window"
 
 
 def test_a_robot_that_is_asked_to_stay_may_stand() -> None:
-    recovery = reversing(1)
+    recovery = Recovery(1, PERIOD)
     assert not any(drive(recovery, np.zeros((100, 2)), np.zeros((1, 10, 2))))
 
 
 def test_a_robot_whose_position_is_unknown_is_not_stuck() -> None:
-    assert not any(drive(reversing(1), np.full((100, 2), np.nan)))
+    assert not any(drive(Recovery(1, PERIOD), np.full((100, 2), np.nan)))
 
 
 def test_after_three_recoveries_in_one_place_it_is_given_up() -> None:
-    recovery = reversing(1)
-    reversed_ = drive(recovery, np.zeros((8 * WINDOW, 2)))
-    assert sum(reversed_) == 3 * DURATION
+    recovery = Recovery(1, PERIOD)
+    helped = drive(recovery, np.zeros((8 * WINDOW, 2)))
+    assert sum(helped) == 3 * DURATION
     assert recovery.given_up.tolist() == [True]
     assert recovery.counts.tolist() == [3]
 
 
 def test_coming_clear_of_the_place_gives_new_tries() -> None:
-    recovery = reversing(1)
+    recovery = Recovery(1, PERIOD)
     drive(recovery, np.zeros((8 * WINDOW, 2)))
-    drive(recovery, np.stack([np.linspace(0.0, 0.6, 20), np.zeros(20)], axis=1), AHEAD + [1.0, 0.0])
+    drive(recovery, np.stack([np.linspace(0.0, 0.6, 20), np.zeros(20)], axis=1), FAR)
     assert not recovery.given_up.any()
-    assert sum(drive(recovery, np.full((8 * WINDOW, 2), (0.6, 0.0)), AHEAD + [1.0, 0.0])) == 3 * DURATION
+    assert sum(drive(recovery, np.full((8 * WINDOW, 2), (0.6, 0.0)), FAR)) == 3 * DURATION
 
 
 def test_each_robot_is_watched_for_itself_and_a_reset_forgets() -> None:
-    recovery = reversing(2)
-    plan, push = np.repeat(AHEAD, 2, axis=0) + [9.0, 0.0], np.repeat(PUSH, 2, axis=0)
-    turned = []
+    recovery = Recovery(2, PERIOD)
+    plan, helped = np.repeat(FAR, 2, axis=0), []
     for t in range(2 * WINDOW):
         if t == WINDOW - 1:
             recovery.reset(np.array([0]))
-        action = recovery(np.array([(0.0, 0.0), (0.05 * t, 0.0)]), plan, push)
-        turned.append((action[:, 0] < 0).tolist())
-    assert not any(row[1] for row in turned)
-    assert [row[0] for row in turned].index(True) == 2 * WINDOW - 1
+        poses = np.array([(0.0, 0.0, 0.0), (0.05 * t, 0.0, 0.0)])
+        followed = recovery(poses, plan, [FREE, FREE])
+        helped.append((followed != plan).any(axis=(1, 2)).tolist())
+    assert not any(row[1] for row in helped)
+    assert [row[0] for row in helped].index(True) == 2 * WINDOW - 1
     recovery.reset()
     assert not recovery.counts.any()
 
 
-def test_what_the_skill_answered_is_not_written_into() -> None:
-    recovery, answer = reversing(1), PUSH.copy()
-    for _ in range(2 * WINDOW):
-        recovery(np.zeros((1, 2)), AHEAD, answer)
-    assert_array_equal(answer, PUSH)
+def test_some_rows_may_be_asked_about_alone() -> None:
+    recovery = Recovery(3, PERIOD)
+    for _ in range(WINDOW + 1):
+        followed = recovery(np.zeros((1, 3)), AHEAD, [FREE], np.array([1]))
+    assert recovery.active.tolist() == [False, True, False]
+    assert followed is not AHEAD
 
 
-def test_a_recovery_shakes_the_robot_anew_each_time_and_the_same_way_in_every_drive() -> None:
-    still = np.zeros((1, 2))
-    drives = []
-    for _ in range(2):
-        recovery = Recovery(1, PERIOD)
-        drives.append(np.array([recovery(still, AHEAD, PUSH)[0] for _ in range(2 * (WINDOW + 1) + DURATION)]))
-    assert_array_equal(*drives)
-    first, second = (drives[0][t : t + DURATION] for t in (WINDOW, 2 * WINDOW + 1))
-    assert (first != second).all() and (np.abs(drives[0]) <= 1.0).all()
-    assert (first != -PUSH).all()
+# the way out
+
+
+def way(plan: np.ndarray, yaw: float = 0.0, other: bool = False, occupancy: OccupancyMap = FREE) -> np.ndarray:
+    return way_out(np.array([0.0, 0.0, yaw]), plan, occupancy, 0.1, other)
+
+
+def test_the_way_out_is_straight_ahead_or_straight_back_whichever_is_nearer_to_the_plan() -> None:
+    assert_allclose(way(AHEAD[0]), AHEAD[0], atol=1e-12)
+    assert_allclose(way(-AHEAD[0]), -AHEAD[0], atol=1e-12)
+    left = AHEAD[0][:, ::-1]
+    assert_allclose(way(left, yaw=np.pi / 4), AHEAD[0] @ [[1, 1], [-1, 1]] / np.sqrt(2), atol=1e-12)
+
+
+def test_the_next_try_goes_the_other_way() -> None:
+    assert_allclose(way(AHEAD[0], other=True), -AHEAD[0], atol=1e-12)
+    recovery = Recovery(1, PERIOD)
+    followed = [recovery(np.zeros((1, 3)), AHEAD, [FREE])[0, -1, 0] for _ in range(3 * WINDOW)]
+    assert followed[WINDOW] == pytest.approx(1.0) and followed[2 * WINDOW + 1] == pytest.approx(-1.0)
+
+
+def test_the_way_out_ends_where_the_map_is_not_free() -> None:
+    walled = empty_map((3.0, 3.0))
+    draw_discs(walled.occupied, walled.origin, walled.resolution, np.array([[0.75, 0.0]]), 0.2)
+    out = way(AHEAD[0], occupancy=walled)
+    assert out[:, 0].max() == pytest.approx(0.4) and walled.is_free(out, 0.1).all()
+    assert_allclose(out[4:], np.broadcast_to(out[3], (6, 2)))
+
+
+def test_a_way_that_is_blocked_at_once_is_not_taken_if_the_other_is_free() -> None:
+    walled = empty_map((3.0, 3.0))
+    draw_discs(walled.occupied, walled.origin, walled.resolution, np.array([[0.45, 0.0]]), 0.2)
+    assert_allclose(way(AHEAD[0], occupancy=walled), -AHEAD[0], atol=1e-12)
+
+
+def test_a_robot_that_is_walled_in_stays() -> None:
+    walled = empty_map((3.0, 3.0))
+    walled.occupied[:] = True
+    assert_allclose(way(AHEAD[0], occupancy=walled), np.zeros((10, 2)), atol=1e-12)

@@ -126,7 +126,7 @@ class Scripted:
         if replanned:
             self.plan_stamp = estimate.stamp
         decision = Decision(
-            action=action, proposed=action, observation=np.zeros(3, np.float32), reason=reason, plan=np.zeros((10, 2)),
+            action=action, observation=np.zeros(3, np.float32), reason=reason, plan=np.zeros((10, 2)),
             start=np.zeros(2), plan_stamp=self.plan_stamp, has_plan=True, replanned=replanned, overdue=0.0,
             refused=False, recovering=False, given_up=False, plan_seconds=0.001,
         )  # fmt: skip
