@@ -77,6 +77,13 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--resume", metavar="RUN", help="go on with this run folder from its last checkpoints")
     train.add_argument("--stage", choices=("planner", "skill", "all"), default="all", help="what to train (all)")
     train.add_argument(
+        "--from",
+        dest="source",
+        metavar="RUN|BUNDLE",
+        help="fine-tune the planner of this run or bundle into a new run, which takes over its skill (--stage planner)",
+    )
+    train.add_argument("--worlds", action="append", metavar="WORLD", help="repeat for a mix (planner.worlds)")
+    train.add_argument(
         "--collector",
         choices=("local", "multi", "ray"),
         help="who simulates: this process, several, or a Ray cluster (skill.collector)",
@@ -209,11 +216,22 @@ def _train(arguments: argparse.Namespace) -> int:
     flags = {"skill.collector": arguments.collector, "skill.workers": arguments.workers}
     flags["skill.ray_address"] = arguments.ray_address
     overrides = [f"{key}={value}" for key, value in flags.items() if value is not None] + arguments.overrides
-    if arguments.resume:
+    if arguments.worlds:
+        overrides.append(f"planner.worlds={json.dumps(arguments.worlds)}")
+    if arguments.source:
+        if arguments.stage != "planner" or arguments.config or arguments.resume:
+            raise RunError("--from fine-tunes the planner: use it with --stage planner, without --config and --resume")
+        from hiernav.finetune import begin_fine_tuning, fine_tuning_config
+
+        config = fine_tuning_config(arguments.source, overrides)
+        _check_worlds(config)
+        _check_machine(config)
+        run = begin_fine_tuning(config, arguments.source)
+    elif arguments.resume:
         if arguments.config or overrides:
             raise RunError(
                 "--resume takes its configuration from the run folder: leave out --config and KEY=VALUE, "
-                "also as --collector, --workers or --ray-address"
+                "also as --worlds, --collector, --workers or --ray-address"
             )
         run = Run.open(arguments.resume)
     else:

@@ -179,7 +179,10 @@ def _from_bundle(path: Path) -> Policies:
     config = TrainConfig(
         robot=manifest.robot,  # type: ignore[arg-type]  # get_robot has checked it
         planner=PlannerConfig(
-            planning_radius_m=manifest.plan.planning_radius_m, soft_margin_m=manifest.plan.soft_margin_m
+            preset=manifest.planner.preset,  # type: ignore[arg-type]  # written from a checked configuration
+            hypotheses=manifest.planner.outputs[0].shape[1] or 1,
+            planning_radius_m=manifest.plan.planning_radius_m,
+            soft_margin_m=manifest.plan.soft_margin_m,
         ),
         option=OptionConfig(
             d_update_m=manifest.replan.d_update_m,

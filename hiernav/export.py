@@ -213,5 +213,5 @@ def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
         "skill_reach_rate": float(best["reach_rate"]),
         "planner_samples": run.config.planner.samples,
         "planner_epochs": int(states["planner"]["epoch"]),
-        "planner_error_m": round(float(states["planner"]["validation"]["error"]), 5),
+        "planner_error_m": round(float(states["planner"]["validation"].get("error", float("nan"))), 5),
     }

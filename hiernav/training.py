@@ -33,7 +33,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         return _train_skill(run, None, progress)
     planner = planner_train.PlannerTrainer(run.config, run)
     done = planner.resume()
-    if done is not None and not planner.finished:
+    if done and not planner.finished:
         _say_resumed(progress, run, "planner", f"epoch {done} of {run.config.planner.epochs}")
     if stage in ("planner", "all") and not planner.finished:
         began = time.perf_counter()

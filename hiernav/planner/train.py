@@ -83,6 +83,7 @@ class PlannerTrainer:
         )
         self.epoch = 0
         self.validation: dict[str, float] = {}
+        self._given = False  # whether training starts from weights that were trained elsewhere
 
     def resume(self) -> int | None:
         """Go back to the last checkpoint; its number of epochs, or None if there is none."""
@@ -94,6 +95,7 @@ class PlannerTrainer:
         self.schedule.load_state_dict(state["schedule"])
         restore_random_state(state, self.device)
         self.epoch, self.validation = state["epoch"], state["validation"]
+        self._given = self.epoch == 0
         return self.epoch
 
     @property
@@ -128,6 +130,9 @@ class PlannerTrainer:
         held_out = make_samples(self.labels, min(_VALIDATION, planner.samples), (seed, _VALIDATION_SEED))
         keep_freed_memory()  # after the samples, which are freed for good
         began, first, total = time.perf_counter(), self.epoch * planner.samples, planner.epochs * planner.samples
+        if self._given:
+            self.validation = self._validate(held_out)
+            self.run.log("planner", 0, self.validation)
         while not self.finished:
             started = time.perf_counter()
             loss = self._epoch(samples, lambda done, now: report("training", done, total, first, now))
@@ -138,7 +143,7 @@ class PlannerTrainer:
                 self.validation |= self._walk()
             self.run.log("planner", self.epoch, self.validation)
             self.run.log_rates("planner", self.epoch, {"samples_per_second": rate})
-            self._save()
+            self.save()
 
     def _epoch(self, samples: Samples, on_batch: Callable[[int, float], None]) -> float:
         self.network.train()
@@ -218,7 +223,8 @@ class PlannerTrainer:
             "walk_reach_rate": float(result.reached.mean()),
         }
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write the checkpoint; before the first epoch it holds the weights that training starts from."""
         self.run.save(
             "planner",
             {

@@ -147,6 +147,8 @@ class SkillTrainer:
         state = self.run.load("skill", rewind=True)
         if state is None:
             return None
+        if state.get("imported"):
+            raise RunError(f"the skill of {self.run.path} comes from a bundle: it drives, but cannot be trained on")
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         restore_random_state(state, self.learner.device)

@@ -159,3 +159,58 @@ def test_the_distance_from_an_old_plan_is_that_of_what_is_left_of_it() -> None:
     np.testing.assert_allclose(apart[0, :2], [0.0, 0.2], atol=1e-9)
     assert apart[0, 2] < 0.02, "driven waypoints count no more"
     assert np.isnan(apart_from(np.full_like(old, np.nan), position, old[:, None])).all()
+
+
+# mirrors and degenerate input
+
+
+def test_a_mirrored_world_gives_the_expert_s_mirrored_plan() -> None:
+    """Where two ways are as long as each other the grid decides; everywhere else plans are mirror images."""
+    apart = []
+    for layout in layouts_of("pillar(2,2,10)", 30, 0.1):
+        ours = layout.occupancy(0.0)
+        theirs = OccupancyMap(ours.occupied[:, ::-1].copy(), ours.resolution, ours.origin)
+        here, goal, flip = layout.start[:2], layout.goal, np.array([-1.0, 1.0])
+        planner = ShortestPathPlanner(0.1, 0.15)
+        plan = planner.plan(query_of([here], [goal], ours))
+        mirrored = planner.plan(query_of([here * flip], [goal * flip], theirs))
+        apart.append(np.linalg.norm(plan - mirrored * flip, axis=-1).max())
+    assert np.mean(np.array(apart) < 1e-6) >= 0.8
+
+
+ALL_FREE, ALL_OCCUPIED = (
+    map_with_pillars(half_size=(1.0, 1.0)),
+    OccupancyMap(np.ones((40, 40), bool), origin=(-1.0, -1.0)),
+)
+ENCLOSED = map_with_pillars([(x, y) for x in (-0.3, 0.0, 0.3) for y in (-0.3, 0.0, 0.3) if x or y], (1.0, 1.0), 0.16)
+
+
+@pytest.mark.parametrize("repair", [False, True])
+@pytest.mark.parametrize(
+    ("occupancy", "start", "goal"),
+    [
+        (ALL_FREE, (0.1, 0.1), (0.1, 0.1)),
+        (ALL_FREE, (0.1, 0.1), (0.2, 0.1)),
+        (ALL_FREE, (-0.9, -0.9), (0.9, 0.9)),
+        (ALL_FREE, (5.0, 5.0), (0.0, 0.0)),
+        (ALL_FREE, (0.0, 0.0), (5.0, 5.0)),
+        (ALL_OCCUPIED, (0.0, 0.0), (0.5, 0.5)),
+        (ENCLOSED, (0.0, 0.0), (0.8, 0.8)),
+        (ENCLOSED, (0.8, 0.8), (0.0, 0.0)),
+        (OccupancyMap(np.zeros((1, 1), bool)), (0.02, 0.02), (0.03, 0.02)),
+        (OccupancyMap(np.ones((1, 1), bool)), (0.02, 0.02), (0.03, 0.02)),
+    ],
+    ids=["start = goal", "one cell", "all free", "start outside", "goal outside", "all occupied", "start enclosed",
+         "goal enclosed", "one free pixel", "one occupied pixel"],
+)  # fmt: skip
+def test_every_planner_answers_degenerate_questions(network, occupancy, start, goal, repair: bool) -> None:
+    """With a plan of ten waypoints or, if repair is on, possibly with none and a reason."""
+    planner = verified(0.1, network) if repair else network
+    plan = planner.plan(query_of([start], [goal], occupancy))
+    assert plan.shape == (1, 10, 2)
+    if not repair or np.isfinite(plan).all():
+        assert np.isfinite(plan).all()
+    else:
+        assert planner.refusals == 1 and sum(planner.reasons.values()) == 1 and "unknown" not in planner.reasons
+    expert = ShortestPathPlanner(0.1).plan(query_of([start], [goal], occupancy))
+    assert expert.shape == (1, 10, 2) and (np.isfinite(expert).all() or np.isnan(expert).all())

@@ -1,0 +1,92 @@
+"""Fine-tuning teaches the planner other worlds, from a run or a bundle alike, and leaves the skill as it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import tiny_run
+
+torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
+
+from hiernav import cli  # noqa: E402
+from hiernav.export import export_run  # noqa: E402
+from hiernav.nav.bundle import load_bundle  # noqa: E402
+from hiernav.planner import train as planner_train  # noqa: E402
+from hiernav.run import Run  # noqa: E402
+
+pytestmark = pytest.mark.train
+OTHER = "pillar(1.5,1.5,3)"
+
+
+@pytest.fixture(autouse=True)
+def few_walks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planner_train, "_WALKS", 3)
+
+
+def command(source: Path, run_dir: Path, *more: str) -> list[str]:
+    arguments = ["train", "--stage", "planner", "--from", str(source), "--worlds", OTHER, f"run_dir={run_dir}"]
+    return [*arguments, "planner.samples=48", "planner.epochs=2", "planner.samples_per_world=12", *more]
+
+
+@pytest.mark.parametrize("kind", ["run", "bundle"])
+def test_the_planner_learns_and_the_skill_stays_what_it_was(
+    able_run: Path, able_bundle: Path, tmp_path: Path, kind: str
+):
+    source = able_run if kind == "run" else able_bundle
+    assert cli.main(command(source, tmp_path / "tuned")) == 0
+    run = Run.open(tmp_path / "tuned")
+    assert run.config.planner.worlds == (OTHER,)
+    before, after = Run.open(able_run).load("planner")["network"], run.load("planner")["network"]
+    assert before.keys() == after.keys() and not all(torch.equal(before[key], after[key]) for key in before)
+    ours, theirs = (load_bundle(folder) for folder in (export_run(run.path, tmp_path / "bundle"), able_bundle))
+    for name, action in ((name, golden) for name, golden in ours.golden.items() if name in ("observation", "action")):
+        assert action.shape == theirs.golden[name].shape
+    skill = Run.open(able_run).load("skill")["best_actor"]
+    assert all(torch.equal(skill[key], value) for key, value in run.load("skill")["best_actor"].items())
+    assert ours.manifest.skill == theirs.manifest.skill
+
+
+def test_training_starts_from_the_weights_of_the_source_and_says_how_good_they_are(able_run: Path, tmp_path: Path):
+    assert cli.main(command(able_run, tmp_path / "tuned", "planner.learning_rate=1e-9")) == 0
+    before, run = Run.open(able_run).load("planner")["network"], Run.open(tmp_path / "tuned")
+    for name, value in run.load("planner")["network"].items():
+        torch.testing.assert_close(value, before[name], rtol=1e-4, atol=1e-5)
+    lines = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [0, 1, 2]
+    assert lines[0]["error"] == pytest.approx(lines[2]["error"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (["robot=car"], "robot cannot be changed by fine-tuning"),
+        (["skill.total_steps=5"], "skill.total_steps cannot be changed"),
+        (["--stage", "all"], "--from fine-tunes the planner"),
+    ],
+)
+def test_what_the_networks_were_trained_for_cannot_be_changed(able_run: Path, tmp_path: Path, capsys, more, named):
+    assert cli.main(command(able_run, tmp_path / "tuned", *more)) == 2
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "tuned").exists()
+
+
+def test_a_bundle_s_skill_drives_but_cannot_be_trained_on(able_bundle: Path, tmp_path: Path, capsys):
+    assert cli.main(command(able_bundle, tmp_path / "tuned")) == 0
+    assert cli.main(["train", "--resume", str(tmp_path / "tuned")]) == 2
+    assert "comes from a bundle" in capsys.readouterr().err
+    assert cli.main(["evaluate", "--run", str(tmp_path / "tuned"), "--world", tiny_run.WORLD, "--episodes", "2"]) == 0
+
+
+def test_a_planner_of_other_layers_is_refused(tmp_path: Path, able_run: Path, capsys):
+    run = Run.open(able_run)
+    state = run.load("planner")
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "config.yaml").write_bytes((able_run / "config.yaml").read_bytes())
+    other = Run.open(copy)
+    other.save("planner", {**state, "network": {**state["network"], "head.weight": torch.zeros(3, 3)}})
+    other.save("skill", run.load("skill"))
+    assert cli.main(command(copy, tmp_path / "tuned")) == 2
+    assert "head.weight is 3x3" in capsys.readouterr().err

@@ -1,0 +1,191 @@
+#!/usr/bin/env python3
+"""The waypoint generator's table: collisions per episode against the number of samples (paper, Table II).
+
+Trains every combination of data set size, network and seed, and lets a disc walk along the plans, unrepaired, in worlds
+it has never seen: five waypoints, a new plan, and so on; every waypoint that touches an obstacle counts 1.
+
+    python tools/planner_table.py --out runs/planner_table                                  # all of it: hours
+    python tools/planner_table.py --out runs/planner_table --samples 1000 --seeds 0         # a part of it
+    python tools/planner_table.py --out runs/planner_table --only-print                     # what there is so far
+
+Stop it at any time: the same command goes on. Results are in OUT/table.json, one entry per combination.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+PAPER = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
+BATCH, UPDATES, EPOCHS = 256, 1_000, 6
+"""Every set is seen six times, and small ones until there were 1,000 updates."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/planner_table"), help="folder of runs and results")
+    parser.add_argument("--samples", type=int, nargs="+", default=list(PAPER), help="sizes (1000 10000 50000 100000)")
+    parser.add_argument("--presets", nargs="+", default=["paper", "default"], choices=("paper", "default"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of training (0 1 2)")
+    parser.add_argument("--world", default="pillar(2,2,10)", help="for training and walks (pillar(2,2,10))")
+    parser.add_argument("--robot", default="point", help="whose radius (point: 0.1 m)")
+    parser.add_argument("--episodes", type=int, default=1000, help="walks (1000)")
+    parser.add_argument("--threads", type=int, default=2, help="of training (2)")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
+    parser.add_argument("--only-print", action="store_true", help="train nothing")
+    arguments = parser.parse_args()
+    results = _read(arguments.out / "table.json")
+    queue = [
+        (samples, preset, seed)
+        for samples in sorted(arguments.samples)
+        for preset in arguments.presets
+        for seed in arguments.seeds
+    ]
+    wanted = {_name(*job): job for job in queue}
+    if not arguments.only_print:
+        missing = [job for name, job in wanted.items() if name not in results]
+        for number, job in enumerate(missing):
+            began = time.perf_counter()
+            print(f"[{number + 1} of {len(missing)}] {_name(*job)}", flush=True)
+            results[_name(*job)] = _run(arguments, *job)
+            _write(arguments.out / "table.json", results)
+            print(f"    {_line(results[_name(*job)])}  {time.perf_counter() - began:.0f} s", flush=True)
+    _print(results)
+    return 0
+
+
+def _run(arguments: argparse.Namespace, samples: int, preset: str, seed: int) -> dict[str, Any]:
+    """Train one planner, or go on training it, and walk."""
+    import numpy as np
+    import torch
+
+    from hiernav.config import load_config
+    from hiernav.planner.dataset import data_seed, label_settings
+    from hiernav.planner.store import read_manifest, write_dataset
+    from hiernav.planner.train import PlannerTrainer, torch_planner
+    from hiernav.run import Run
+    from hiernav.sim.layout import parse_world
+    from hiernav.sim.walk import walk
+    from hiernav.sim.worlds import sample_layout
+
+    torch.set_num_threads(arguments.threads)
+    folder = arguments.out / _name(samples, preset, seed)
+    # the sizes are the first samples of one set for each network and seed
+    data = arguments.out / f"data-{preset}-{seed}"
+    config = load_config(
+        None,
+        [
+            f"robot={arguments.robot}",
+            f"seed={seed}",
+            f"threads={arguments.threads}",
+            f"run_dir={folder}",
+            f"planner.preset={preset}",
+            f"planner.samples={samples}",
+            f"planner.worlds={json.dumps([arguments.world])}",
+            f"planner.data={data}",
+            f"planner.epochs={_epochs(samples)}",
+            f"planner.batch_size={BATCH}",
+            *arguments.set,
+        ],
+    )
+    run = Run.open(folder) if (folder / "config.yaml").exists() else Run.create(config)
+    if not (data / "dataset.json").exists() or read_manifest(data).samples < samples:
+        write_dataset(
+            data, label_settings(config), samples, data_seed(config), arguments.threads, _show("data set", samples)
+        )
+    trainer = PlannerTrainer(run.config, run)
+    trainer.resume()
+    began = time.perf_counter()
+    total = config.planner.epochs * samples
+    shown = _show("training", total)
+    trainer.train(lambda now: shown(now.done) if now.stage == "training" else None)
+    seconds = time.perf_counter() - began
+    run.close()
+    radius = trainer.labels.radius
+    layouts = [
+        sample_layout(parse_world(arguments.world), int(s), radius)
+        for s in np.random.SeedSequence((0x7AB1E,)).generate_state(arguments.episodes)
+    ]
+    result = walk(torch_planner(trainer.network, trainer.labels), layouts, radius)
+    return {
+        "samples": samples,
+        "preset": preset,
+        "seed": seed,
+        "world": arguments.world,
+        "robot": arguments.robot,
+        "episodes": arguments.episodes,
+        "epochs": config.planner.epochs,
+        "collisions_mean": float(result.collisions.mean()),
+        "collision_free_rate": float((result.reached & (result.collisions == 0)).mean()),
+        "reach_rate": float(result.reached.mean()),
+        "plans_mean": float(result.plans.mean()),
+        "error_m": trainer.validation["error"],
+        "train_seconds": round(seconds, 1),
+        "settings": arguments.set,
+    }
+
+
+def _epochs(samples: int) -> int:
+    return max(EPOCHS, -(-UPDATES * BATCH // samples))
+
+
+def _show(what: str, total: int) -> Any:
+    """Progress with a rate, one line every 20 s."""
+    began, last = time.perf_counter(), time.perf_counter()
+
+    def show(done: int) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if now - last > 20.0:
+            last = now
+            rate = max(done, 1) / (now - began)
+            print(
+                f"    {what}: {done:,} of {total:,}  {rate:,.0f}/s  {(total - done) / rate / 60:.1f} min left",
+                flush=True,
+            )
+
+    return show
+
+
+def _name(samples: int, preset: str, seed: int) -> str:
+    return f"{preset}-{samples}-{seed}"
+
+
+def _line(result: dict[str, Any]) -> str:
+    return f"collisions {result['collisions_mean']:.3f}  reach {result['reach_rate']:.3f}"
+
+
+def _print(results: dict[str, dict[str, Any]]) -> None:
+    import numpy as np
+
+    print(f"\n{'samples':>8}  {'paper says':>10}  " + "  ".join(f"{preset:>16}" for preset in ("paper", "default")))
+    for samples in sorted({r["samples"] for r in results.values()}):
+        cells = []
+        for preset in ("paper", "default"):
+            found = [r for r in results.values() if (r["samples"], r["preset"]) == (samples, preset)]
+            values = [r["collisions_mean"] for r in found]
+            spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
+            cells.append(f"{np.mean(values):.3f}{spread} ({len(values)})" if values else "-")
+        print(f"{samples:8,}  {PAPER.get(samples, float('nan')):10.2f}  " + "  ".join(f"{cell:>16}" for cell in cells))
+    print("collisions per episode, mean over seeds ± standard deviation (seeds)")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
+def _write(file: Path, results: dict[str, Any]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_name(file.name + ".part")
+    partial.write_text(json.dumps(results, indent=2) + "\n")
+    partial.replace(file)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
