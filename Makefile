@@ -17,7 +17,7 @@ REQUIREMENTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format bench clean
+.PHONY: help demo test soak mutants lint format bench clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -28,6 +28,12 @@ demo: $(BASE_STAMP) ## drive simulated robots in real time with the shipped netw
 
 test: $(DEV_STAMP) ## run the tests, slow and real-time ones left out
 	@$(BIN)/python -m pytest $(TEST_ARGS)
+
+soak: $(DEV_STAMP) ## a million ticks of the loop under random faults (half an hour)
+	@$(BIN)/python -m pytest -m slow -s tests/runtime/test_soak.py
+
+mutants: $(DEV_STAMP) ## switch each watchdog off in turn; the test of its fault must fail
+	@$(BIN)/python -m pytest -m slow tests/runtime/test_mutations.py
 
 lint: $(DEV_STAMP) ## check style, formatting and types
 	@$(BIN)/ruff check

@@ -62,6 +62,8 @@ class FixedRateLoop:
         self.late = 0.0
         """How long after its deadline the present tick began [s]."""
         self.ticks = 0
+        self.phase_error = 0.0
+        """How far the newest deadline lies from a whole number of periods after the first [s]; 0 but for rounding."""
         self.overruns = 0
         """Deadlines that were skipped, in all."""
         self.overruns_in_a_row = 0
@@ -108,6 +110,7 @@ class FixedRateLoop:
             deadline = start + index * self.period
             self.clock.sleep_until(deadline)
             now = self.clock.now()
+            self.phase_error = math.remainder(deadline - start, self.period)
             self.late = max(now - deadline, 0.0)
             self.lateness.record(self.late)
             self.ticks += 1

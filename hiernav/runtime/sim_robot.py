@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,9 @@ from hiernav.sim.worlds import Layout, parse_world, sample_layout
 __all__ = ["EXACT", "SensorNoise", "SimRobot", "make"]
 
 
-def make(robot: str, world: str, seed: int = 0, noise: dict[str, Any] | None = None) -> SimRobot:
+def make(
+    robot: str, world: str, seed: int = 0, noise: dict[str, Any] | None = None, substeps: int | None = None
+) -> SimRobot:
     """A simulated robot in real time, for `ProcessRobot`.
 
     Args:
@@ -29,8 +32,11 @@ def make(robot: str, world: str, seed: int = 0, noise: dict[str, Any] | None = N
         world: kind of world, as on the command line.
         seed: of the world and of the noise; `SimRobot.restart` takes another one.
         noise: fields of `SensorNoise` that differ from their defaults.
+        substeps: physics steps per command, where it is not to be driven at the rate it was trained at.
     """
     spec = get_robot(robot)
+    if substeps is not None:
+        spec = replace(spec, substeps=substeps)
     layout = sample_layout(parse_world(world), seed, spec.radius)
     return SimRobot(spec, layout, SensorNoise(**(noise or {})), seed, MonotonicClock())
 

@@ -1,0 +1,125 @@
+"""Every watchdog is switched off in turn, in a copy of the source: the test of its fault must then fail."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 150.0
+"""Time for one test [s]. A loop that never ends, for want of what would have ended it, has failed as well."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A watchdog switched off by replacing one piece of source, and the tests that must notice."""
+
+    name: str
+    file: str
+    source: str
+    instead: str
+    tests: str
+
+
+R, F, T = "hiernav/runtime", "tests/runtime/faults", "tests/runtime"
+WATCH = f"{R}/watchdogs.py"
+MUTANTS = (
+    Mutant("lost sensors", WATCH, "if age > self.lost_after:", "if False:", f"{F}/test_01_waiting_for_sensors.py"),
+    Mutant("silent sensors", WATCH, "if age > self.hold_after:", "if False:", f"{F}/test_01_waiting_for_sensors.py"),
+    Mutant("frozen sensor", f"{R}/freshness.py", "if sensor.repeats < REPEATS", "if True or sensor.repeats < REPEATS",
+           f"{F}/test_02_frozen_value.py"),
+    Mutant("old stamp", f"{R}/estimator.py", "stamp <= self._stamp:", "False:", f"{F}/test_06_stamps.py"),
+    Mutant("gate of positions", f"{R}/planar_filter.py", "if not 0.0 <= distance <= gate:", "if False:",
+           f"{F}/test_04_spikes.py"),
+    Mutant("overruns", WATCH, "if overruns_in_a_row >= self.limit:", "if False:", f"{F}/test_22_overload.py"),
+    Mutant("overdue plan, slow", WATCH, "if overdue <= self.slow_after:", "if overdue <= self.hold_after:",
+           f"{F}/test_09_planner_hangs.py::test_the_old_plan_is_followed_then_slowly_and_then_the_robot_holds"),
+    Mutant("overdue plan, hold", WATCH, "if overdue <= self.hold_after:", "if True:",
+           f"{F}/test_09_planner_hangs.py::test_the_old_plan_is_followed_then_slowly_and_then_the_robot_holds"),
+    Mutant("no way", WATCH, "waited > self.give_up_after", "False", f"{F}/test_24_goal_unreachable.py"),
+    Mutant("saturation", WATCH, "and self._sum >= self._limit", "and False", f"{F}/test_13_saturated_action.py"),
+    Mutant("stop", WATCH, "moving = estimate is None or not", "moving = False and not", f"{T}/test_driver.py"),
+    Mutant("adapter", f"{R}/robot.py", "if now - self._fed_at <= self.timeout:", "if True:",
+           f"{F}/test_21_control_process_gone.py"),
+    Mutant("action not finite", f"{R}/guard.py", "if not np.isfinite(action).all():", "if False:",
+           f"{F}/test_12_skill_not_finite.py"),
+    Mutant("third action not finite", f"{R}/guard.py", "if self._non_finite >= self.config.max_non_finite:",
+           "if False:", f"{F}/test_12_skill_not_finite.py"),
+    Mutant("actuator limits", f"{R}/guard.py", "min(max(value, low), high) for value in values",
+           "value for value in values", f"{T}/test_guard.py"),
+    Mutant("slew limit", f"{R}/guard.py", "            limited = steady\n", "            pass\n", f"{T}/test_guard.py"),
+    Mutant("tilt", f"{R}/guard.py", "if self._tilted < self.config.max_tilted:", "if True:", f"{F}/test_30_fallen.py"),
+    Mutant("time to collision", f"{R}/guard.py", "not ttc >= slow", "False", f"{F}/test_26_obstacle_moves_in.py"),
+    Mutant("recoveries", "hiernav/nav/recovery.py", "stuck & (self._tries >= self.limit)", "stuck & False",
+           f"{F}/test_28_pinned.py"),
+    Mutant("reach of a recovery", "hiernav/nav/recovery.py", "> self.reach_m] = 0", "> 1e9] = 0",
+           f"{F}/test_28_pinned.py"),
+    Mutant("hanging planner", f"{R}/process_planner.py", 'self._child.nudge(b"r")', "pass",
+           f"{F}/test_09_planner_hangs.py::test_a_hanging_process_is_replaced_three_times_and_then_given_up"),
+    Mutant("killed planner", f"{R}/planner_process.py", "if memory.status.restarts < MAX_RESTARTS:", "if False:",
+           f"{F}/test_10_planner_killed.py"),
+    Mutant("late plan", f"{R}/pilot.py", "if stamp - answer.stamp > self.max_age:", "if False:",
+           f"{F}/test_09_planner_hangs.py::test_an_answer_that_comes_too_late_is_not_followed"),
+    Mutant("unsound plan", f"{R}/pilot.py", "if occupancy.contains(plan).all():", "if True:",
+           f"{F}/test_11_unsound_plan.py"),
+    Mutant("endless hold", f"{R}/driver.py", "elif now - self._held_since > self.config.hold_timeout:", "elif False:",
+           f"{F}/test_09_planner_hangs.py::test_the_old_plan_is_followed_then_slowly_and_then_the_robot_holds"),
+    Mutant("goal in an obstacle", "hiernav/nav/goal.py", "if not occupancy.occupied_at(goal):", "if True:",
+           f"{F}/test_23_goal_in_obstacle.py"),
+    Mutant("start in an obstacle", "hiernav/nav/goal.py", "if occupancy.occupied_at(start):", "if False:",
+           f"{F}/test_27_start_outside.py"),
+    Mutant("brake on every way out", f"{R}/loop.py", "                self._brake()\n", "                pass\n",
+           f"{T}/test_loop.py"),
+    Mutant("latch", f"{R}/supervisor.py", "Mode.FAULT: frozenset({Mode.ESTOP})",
+           "Mode.FAULT: frozenset({Mode.ESTOP, Mode.RUNNING})", f"{T}/test_supervisor.py"),
+    Mutant("other robot", "hiernav/nav/bundle.py", "if sha256 != self.manifest.robot_sha256:", "if False:",
+           f"{F}/test_16_other_robot.py"),
+    Mutant("limit of requests", f"{R}/driver.py", "deque(maxlen=REQUESTS)", "deque()", f"{F}/test_29_viewer_stalls.py"),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of what the tests need."""
+    folder = tmp_path_factory.mktemp("mutant")
+    skip = shutil.ignore_patterns("__pycache__", "*.onnx.tmp")
+    for part in ("hiernav", "tests", "deploy"):
+        shutil.copytree(ROOT / part, folder / part, ignore=skip)
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+def test_every_mutant_finds_its_source_once():
+    """Cheap, and in the default run: a mutant whose source has been rewritten would check nothing."""
+    for mutant in MUTANTS:
+        assert (ROOT / mutant.file).read_text().count(mutant.source) == 1, mutant.name
+        assert (ROOT / mutant.tests.partition("::")[0]).is_file(), mutant.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name.replace(" ", "_"))
+def test_its_fault_is_noticed_when_a_watchdog_is_off(mutant: Mutant, copy: Path) -> None:
+    file = copy / mutant.file
+    before = file.read_text()
+    file.write_text(before.replace(mutant.source, mutant.instead))
+    try:
+        code = run_tests(copy, mutant.tests)
+    finally:
+        file.write_text(before)
+    assert code == 1, f"{mutant.name}: {mutant.tests} ended with {code} although it was switched off"
+
+
+def run_tests(folder: Path, tests: str) -> int:
+    """Exit code of pytest: 0 passed, 1 failed; a run that takes too long has failed."""
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", tests]
+    try:
+        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, timeout=PATIENCE).returncode
+    except subprocess.TimeoutExpired:
+        return 1
