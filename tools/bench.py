@@ -5,9 +5,10 @@
     --update  SAC updates/s against the same update hand-written in plain torch, and the machine's matrix-product peak
     --peers   SAC updates/s beside torchrl's plain loop, Stable-Baselines3 and SBX (see tools/sac_peers.py); on request
     --tick    cost of one control step on the robot side, by section
+    --loop    the real-time loop in its three processes, 3 minutes (see tools/bench_loop.py); on request
     --plan    cost of a shortest-path field, a GOSELO image and the planner network
 
-All but --peers by default. Close other programs first: ratios survive a busy machine, figures do not.
+All but --peers and --loop by default. Close other programs first: ratios survive a busy machine, figures do not.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from bench_env import bench_env
 from bench_updates import bench_peers, bench_update
 from race import timed
 
-PARTS = ("env", "update", "peers", "tick", "plan")
+PARTS = ("env", "update", "peers", "tick", "loop", "plan")
+ON_REQUEST = ("peers", "loop")
 
 
 def main() -> int:
@@ -44,7 +46,7 @@ def main() -> int:
     arguments = parser.parse_args()
     parts = [name for name in PARTS if getattr(arguments, name)]
     results: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "threads": arguments.threads}
-    for name in parts or [name for name in PARTS if name != "peers"]:
+    for name in parts or [name for name in PARTS if name not in ON_REQUEST]:
         results[name] = BENCHES[name](arguments)
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
@@ -129,7 +131,14 @@ def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
     return results
 
 
-BENCHES = {"env": bench_env, "update": bench_update, "peers": bench_peers, "tick": bench_tick, "plan": bench_plan}
+BENCHES: dict[str, Callable[[argparse.Namespace], Any]] = {
+    "env": bench_env,
+    "update": bench_update,
+    "peers": bench_peers,
+    "tick": bench_tick,
+    "loop": lambda arguments: bench_loop(arguments.bundle),
+    "plan": bench_plan,
+}
 
 
 if __name__ == "__main__":

@@ -1,0 +1,113 @@
+"""Claims about commanding a running loop: goals are set, changed and cancelled, and nonsense is answered with why."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from puck import Puck, driver_of
+
+from hiernav.runtime.clock import MonotonicClock
+from hiernav.runtime.control import ControlServer, tell
+from hiernav.runtime.driver import Driver
+
+
+@pytest.fixture
+def serving(tmp_path: Path) -> Iterator[tuple[Driver, Path]]:
+    driver = driver_of(Puck(control_period=0.02, noise=1e-3), clock=MonotonicClock())
+    path = tmp_path / "control.sock"
+    thread = threading.Thread(target=driver.serve)
+    with ControlServer(driver, path):
+        thread.start()
+        yield driver, path
+        driver.quit()
+        thread.join(30.0)
+    assert not thread.is_alive() and not path.exists()
+
+
+def until(path: Path, patience: float = 30.0, **wanted: object) -> dict[str, object]:
+    end = time.monotonic() + patience
+    while True:
+        status = tell(path, "status")
+        if all(status[key] == value for key, value in wanted.items()):
+            return status
+        assert time.monotonic() < end, status
+        time.sleep(0.02)
+
+
+def test_a_goal_is_set_changed_paused_and_cancelled(serving):
+    _, path = serving
+    until(path, mode="ready")
+    assert "error" not in tell(path, "goal 1.9,0")
+    until(path, mode="running", goal=[1.9, 0.0])
+    tell(path, "goal -1.9,-0.5")
+    until(path, mode="running", goal=[-1.9, -0.5])
+    tell(path, "pause")
+    until(path, mode="hold")
+    tell(path, "resume")
+    until(path, mode="running")
+    tell(path, "cancel")
+    status = until(path, mode="ready", goal=None)
+    until(
+        path, last={"reason": "cancelled", "detail": "", "steps": status["last"]["steps"]} if status["last"] else None
+    )
+
+
+def test_a_stop_latches_until_it_is_acknowledged_and_leads_to_ready_not_to_running(serving):
+    _, path = serving
+    until(path, mode="ready")
+    tell(path, "goal 1.9,0")
+    until(path, mode="running")
+    tell(path, "stop")
+    until(path, mode="estop", fault="stop was commanded", goal=None)
+    tell(path, "goal 1.0,0")
+    time.sleep(0.1)
+    assert tell(path, "status")["mode"] == "estop"
+    tell(path, "acknowledge")
+    until(path, mode="ready", fault=None, goal=None)
+
+
+@pytest.mark.parametrize("command", ["goal", "goal a,b", "goal nan,0", "goal 1,2,3", "dance", "cancel now", "", "  "])
+def test_nonsense_is_answered_with_why_and_changes_nothing(serving, command):
+    driver, path = serving
+    assert "error" in tell(path, command)
+    assert driver.goal is None
+
+
+def test_a_client_that_floods_or_stalls_is_dropped(serving):
+    _, path = serving
+    for data in (b"x" * 100_000, b"\xff\xfe\n", b""):
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(path))
+            try:
+                client.sendall(data)
+                client.shutdown(socket.SHUT_WR)
+                client.recv(4096)
+            except OSError:
+                pass
+    assert "error" not in tell(path, "status")
+
+
+def test_only_this_user_may_connect_and_two_loops_do_not_share_a_socket(serving):
+    driver, path = serving
+    assert path.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(ValueError, match="another loop listens there"):
+        ControlServer(driver, path)
+
+
+def test_where_nothing_listens_that_is_said(tmp_path):
+    with pytest.raises(ValueError, match="no loop answers"):
+        tell(tmp_path / "absent.sock", "status")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ValueError, match="there is something else"):
+        ControlServer(driver_of(), tmp_path / "file")
+
+
+def test_a_goal_must_be_finite():
+    with pytest.raises(ValueError, match="finite"):
+        driver_of().set_goal(np.array([np.nan, 0.0]))

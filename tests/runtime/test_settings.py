@@ -1,0 +1,52 @@
+"""Claims about the runtime's settings: strict, by section, and those that ship can be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from shipped import ROOT
+
+from hiernav.decode import ConfigError
+from hiernav.runtime.settings import Settings, load_settings
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_the_settings_that_ship_can_be_read(robot):
+    settings = load_settings(ROOT / "deploy" / f"{robot}.yaml")
+    assert settings != Settings()
+
+
+def test_the_command_line_goes_over_the_file_and_the_file_over_the_robot(tmp_path: Path):
+    file = tmp_path / "s.yaml"
+    file.write_text("guard: {slow_ttc: 0.5}\ndriver: {max_steps: 7}\n")
+    asked = {"driver": {"max_steps": 3, "robot_radius": 0.2}}
+    settings = load_settings(file, ["guard.slow_ttc=0.7", "realtime.cpus=[0, 1]"], asked)
+    assert (settings.guard.slow_ttc, settings.driver.max_steps, settings.driver.robot_radius) == (0.7, 7, 0.2)
+    assert settings.realtime.cpus == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("override", "why"),
+    [
+        ("guard.slow_tcc=1", "did you mean 'slow_ttc'"),
+        ("gard.slow_ttc=1", "did you mean 'guard'"),
+        ("guard.slow_ttc=-1", "must be finite and positive"),
+        ("guard.slow_ttc=.nan", "must be finite and positive"),
+        ("driver.max_steps=many", "Expected `int`"),
+        ("driver=1", "expected section.key=value"),
+        ("driver.max_steps", "expected section.key=value"),
+    ],
+)
+def test_what_is_not_a_setting_is_refused_with_its_name(override, why):
+    with pytest.raises(ConfigError) as refused:
+        load_settings(None, [override])
+    assert why in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["- 1", "guard: 3", "guard: [1]", "nothing: {}", "guard: {low: x}"])
+def test_a_malformed_file_is_refused_with_its_name(tmp_path: Path, text: str):
+    file = tmp_path / "s.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"s\.yaml"):
+        load_settings(file)
