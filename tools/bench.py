@@ -26,6 +26,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from bench_env import bench_env
+from bench_loop import bench_loop
 from bench_updates import bench_peers, bench_update
 from race import timed
 
