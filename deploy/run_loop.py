@@ -9,6 +9,7 @@ a summary on screen and as JSON. Ctrl-C brakes the robot, verifies that it stand
   run_loop.py --serve                             be ready for goals, until Ctrl-C
   run_loop.py --tell "goal 1.2,-0.5"              command the loop that runs: goal X,Y, cancel, pause, resume, stop,
                                                   acknowledge, status, quit
+  run_loop.py --view                              drive in a simulated world, and watch and click in the browser
   run_loop.py --dry-run                           check bundle, robot and host; nothing moves
 
 Settings (--set guard.slow_ttc=0.5, or a YAML file with sections) are those of driver, estimator, guard, realtime and
@@ -28,6 +29,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +43,7 @@ from hiernav.runtime.control import ControlServer, default_socket, parse_point, 
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.dry_run import print_report, report
 from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.faulty import FAULTS, FaultyRobot
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.noise import EXACT
 from hiernav.runtime.observe import Event, Observer, TickRecord
@@ -59,6 +62,7 @@ from hiernav.sim.worlds import sample_layout
 
 if TYPE_CHECKING:
     from hiernav.runtime.recorder import Recorder
+    from hiernav.view.link import ViewerLink
 
 BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
@@ -145,6 +149,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--dry-run", action="store_true", help="check everything, and move nothing")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/drive-TIME)")
     parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file with every tick (hiernav replay FILE)")
+    parser.add_argument(
+        "--view", nargs="?", type=int, const=8080, metavar="PORT",
+        help="live page in the browser, for this machine alone (8080); stays ready for goals, until Ctrl-C",
+    )  # fmt: skip
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary here too")
     return parser
@@ -201,8 +209,9 @@ def _process_robot(
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.episodes < 1:
         raise ValueError(f"--episodes is {arguments.episodes}, it must be at least 1")
-    if arguments.fast and (arguments.serve or arguments.adapter or arguments.planner == "process"):
-        raise ValueError("--fast has no real time: it goes with none of --serve, --adapter and --planner process")
+    view = arguments.view is not None
+    if arguments.fast and (arguments.serve or view or arguments.adapter or arguments.planner == "process"):
+        raise ValueError("--fast has no real time: it goes with none of --serve, --view, --adapter, --planner process")
     spec, world = get_robot(arguments.robot), parse_world(arguments.world)
     goal = None if arguments.goal is None else _parse_goal(arguments.goal)
     settings = _settings(arguments, spec)
@@ -216,7 +225,7 @@ def _run(arguments: argparse.Namespace) -> int:
             link = ProcessPlanner(bundle, spec.radius, layouts[0].occupancy(0.0).occupied.size)
             stack.callback(link.close)
         episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
-        return episodes.serve() if arguments.serve else episodes.drive()
+        return episodes.serve() if arguments.serve or view else episodes.drive()
 
 
 class Episodes:
@@ -245,9 +254,10 @@ class Episodes:
             simulated = SimRobot(spec, self.layout, settings.noise, self.layout.seed)
             clock, robot = FakeClock(), simulated
             self._reset = lambda layout: simulated.reset(layout, layout.seed)
+        rehearsal = None if arguments.view is None else FaultyRobot(robot, arguments.seed)
         guard = replace(settings.guard, slew_limit=bundle.manifest.guard.slew_limit)
         self.driver = Driver(
-            robot,
+            rehearsal or robot,
             Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS, link), link),
             lambda stamp: self.layout.occupancy(stamp),
             clock,
@@ -256,6 +266,7 @@ class Episodes:
             replace(settings.driver, max_steps=self.layout.spec.max_steps),
         )
         self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
+        self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)
         self.out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
         self.out.mkdir(parents=True, exist_ok=True)
         self.granted = {} if arguments.fast else request_realtime(settings.realtime)
@@ -282,6 +293,8 @@ class Episodes:
         """Ready for goals until interrupted."""
         drive = Drive()
         self._watch(drive)
+        if self.page is not None and not (self.arguments.serve or self.arguments.adapter):
+            self.page.first_goal = self.layout.goal
         path = self.arguments.control or default_socket()
         with ControlServer(self.driver, path):
             self.console.print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})", highlight=False)
@@ -290,7 +303,7 @@ class Episodes:
         return self._finish([] if result is None else [self._episode(self.layout, result, drive)], [drive])
 
     def _watch(self, drive: Drive) -> None:
-        self.driver.audience.observers = [drive, *filter(None, [self.recorder])]
+        self.driver.audience.observers = [drive, *filter(None, [self.recorder, self.page])]
 
     def _episode(self, layout: Layout, result: RunResult, drive: Drive) -> Episode:
         truth = self.driver.truth()
@@ -304,8 +317,8 @@ class Episodes:
         return Episode(layout.seed, result, collisions, distance)
 
     def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
-        if self.recorder is not None:
-            self.recorder.close()
+        for observer in filter(None, (self.recorder, self.page)):
+            observer.close()
         summary = summarise(episodes, self.driver.timer, self.driver.loop, self.granted)
         summary["recording"] = None if self.recorder is None else self.recorder.summary()
         summary["startup_seconds"] = drives[0].armed_age
@@ -356,6 +369,17 @@ def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle
         world=f"{arguments.world}, seed {arguments.seed}, {arguments.episodes} episodes",
     )
     return Recorder(arguments.record, about.metadata())
+
+
+def _open_page(arguments: argparse.Namespace, driver: Driver, rehearsal: FaultyRobot, spec: RobotSpec) -> ViewerLink:
+    from hiernav.view.link import ViewerLink
+
+    # nobody rehearses faults with a robot that can hurt someone
+    faults = {} if arguments.adapter else {name: partial(rehearsal.inject, name) for name in FAULTS}
+    title = f"hiernav: {spec.name} in {arguments.world}"
+    page = ViewerLink(driver, spec.radius, driver.config.goal_radius, title, arguments.view, faults)
+    print(f"live page: {page.url}", flush=True)
+    return page
 
 
 def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | None) -> Layout:

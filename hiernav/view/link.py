@@ -1,0 +1,220 @@
+"""The control loop's side of the live page: shows ticks to a process of its own, and takes commands from it.
+
+Nothing here waits. A page that is stalled misses ticks, one that floods is heard a few times a tick, and one that has
+died is forgotten; the robot drives on.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.runtime import messages
+from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.view.commands import MAX_BYTES, Command, Settings
+
+SHOW_HZ = 20.0
+"""Ticks shown a second."""
+COMMANDS_PER_TICK = 4
+LARGEST_MAP = 1_000_000
+"""Pixels of a map that is shown as it is; a larger one is shown coarser."""
+START_SECONDS = 30.0
+"""What the page's process is given to come up, before the robot moves [s]."""
+
+PROGRAM = (sys.executable, "-m", "hiernav.view")
+
+log = logging.getLogger(__name__)
+
+
+class Control(Protocol):
+    """What the page may ask for: `hiernav.runtime.driver.Driver` has it all. Safe to call between ticks."""
+
+    def set_goal(self, goal: np.ndarray) -> None: ...
+    def cancel(self) -> None: ...
+    def pause(self) -> None: ...
+    def resume(self) -> None: ...
+    def estop(self, why: str) -> None: ...
+    def acknowledge(self) -> None: ...
+
+
+class ViewerLink(Observer):
+    """Shows a run on a page that `python -m hiernav.view` serves on 127.0.0.1."""
+
+    def __init__(
+        self,
+        control: Control,
+        robot_radius: float,
+        goal_radius: float,
+        title: str = "hiernav",
+        port: int = 8080,
+        faults: Mapping[str, Callable[[], None]] | None = None,
+        program: Sequence[str] = PROGRAM,
+    ) -> None:
+        """Start the page's process and wait for it; the robot must not be moving yet.
+
+        Args:
+            control: takes the commands.
+            robot_radius: [m].
+            goal_radius: [m].
+            title: of the page.
+            port: to listen on; the next free one if it is taken, any if 0.
+            faults: what can be injected, by name.
+            program: that serves the page; it is given the number of its end of the socket.
+
+        Raises:
+            ValueError: the page does not come up.
+        """
+        if program is PROGRAM and find_spec("viser") is None:
+            raise ValueError("the live page needs viser: install it with `pip install 'hiernav[view]'`")
+        self.control, self.faults = control, dict(faults or {})
+        self.shown = self.dropped = self.refused = 0
+        """Ticks shown, messages the page was too slow for, and commands that made no sense."""
+        self.first_goal: np.ndarray | None = None
+        """(2,) goal to set at the first tick [m]."""
+        self._encoder = messages.TickEncoder()
+        self._shown_at = -math.inf
+        self._coarse: tuple[OccupancyMap, OccupancyMap | None] | None = None
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket: socket.socket | None = ours
+        with theirs:
+            # In a session of its own: Ctrl-C is for the loop, which then closes the socket.
+            self._process = subprocess.Popen(
+                [*program, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        self.url = self._start(Settings(title, robot_radius, goal_radius, port, tuple(self.faults)))
+        """Address of the page."""
+
+    def tick(self, record: TickRecord) -> None:
+        if self._socket is None:
+            return
+        if self.first_goal is not None:
+            self.control.set_goal(self.first_goal)
+            self.first_goal = None
+        for _ in range(COMMANDS_PER_TICK):
+            if not self._take_command():
+                break
+        if abs(record.time - self._shown_at) < 1.0 / SHOW_HZ:
+            return
+        self._shown_at = record.time
+        if record.occupancy is not None and record.occupancy.occupied.size > LARGEST_MAP:
+            record = self._with_coarse_map(record, record.occupancy)
+        for topic, data in self._encoder.encode(record):
+            if not self._send(topic, data):
+                # what is left out may be a map or a plan: show both again with the next tick
+                self._encoder = messages.TickEncoder()
+                return
+        self.shown += 1
+
+    def event(self, event: Event) -> None:
+        self._send("/event", messages.encode_event(event))
+
+    def close(self) -> None:
+        """End the page's process."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        try:
+            self._process.wait(3.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _start(self, settings: Settings) -> str:
+        assert self._socket is not None
+        try:
+            self._socket.send(msgspec.json.encode(settings))
+            self._socket.settimeout(START_SECONDS)
+            answer = msgspec.json.decode(self._socket.recv(MAX_BYTES), type=Command)
+        except (OSError, msgspec.DecodeError) as error:
+            self.close()
+            raise ValueError(f"the live page does not come up: {error}") from None
+        self._socket.setblocking(False)
+        return answer.text
+
+    def _send(self, topic: str, data: bytes) -> bool:
+        if self._socket is None:
+            return False
+        payload = topic.encode() + b"\n" + data
+        if len(payload) > MAX_BYTES:
+            self.dropped += 1
+            return topic == "/map"
+        try:
+            self._socket.send(payload)
+            return True
+        except BlockingIOError:
+            self.dropped += 1
+        except OSError:
+            self._forget()
+        return False
+
+    def _take_command(self) -> bool:
+        """Do what the page asks for next; False if it asks for nothing."""
+        if self._socket is None:
+            return False
+        try:
+            data = self._socket.recv(MAX_BYTES)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b""
+        if not data:
+            self._forget()
+            return False
+        try:
+            self._obey(msgspec.json.decode(data, type=Command))
+        except (msgspec.DecodeError, ValueError, KeyError):
+            self.refused += 1
+        return True
+
+    def _obey(self, command: Command) -> None:
+        match command.kind:
+            case "goal":
+                self.control.set_goal(np.array([command.x, command.y]))
+            case "estop":
+                self.control.estop("stopped on the live page")
+            case "fault":
+                self.faults[command.text]()
+            case "cancel" | "pause" | "resume" | "acknowledge":
+                getattr(self.control, command.kind)()
+
+    def _forget(self) -> None:
+        log.warning("the live page is gone; the robot drives on")
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _with_coarse_map(self, record: TickRecord, occupancy: OccupancyMap) -> TickRecord:
+        """A large map is made coarser in a thread, once; until that is done none is shown."""
+        if self._coarse is None or self._coarse[0] is not occupancy:
+            self._coarse = (occupancy, None)
+            threading.Thread(target=self._make_coarse, args=(occupancy,), name="coarse map", daemon=True).start()
+        return replace(record, occupancy=self._coarse[1])
+
+    def _make_coarse(self, occupancy: OccupancyMap) -> None:
+        self._coarse = (occupancy, coarser(occupancy, LARGEST_MAP))
+
+
+def coarser(occupancy: OccupancyMap, most: int) -> OccupancyMap:
+    """A map of at most about `most` pixels; each is occupied if anything in it is."""
+    rows, columns = occupancy.occupied.shape
+    step = max(1, math.ceil(math.sqrt(rows * columns / most)))
+    rows_from, columns_from = np.arange(0, rows, step), np.arange(0, columns, step)
+    by_row = np.logical_or.reduceat(occupancy.occupied, rows_from, axis=0)
+    pixels = np.logical_or.reduceat(by_row, columns_from, axis=1)
+    return OccupancyMap(pixels, occupancy.resolution * step, occupancy.origin)

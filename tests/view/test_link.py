@@ -1,0 +1,193 @@
+"""The loop's side of the live page, with programs in the place of the page that behave well, badly, or not at all."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.runtime import messages
+from hiernav.runtime.observe import TickRecord
+from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.supervisor import Mode
+from hiernav.view.link import COMMANDS_PER_TICK, ViewerLink, coarser
+
+PREAMBLE = """
+import json, socket, sys, time
+link = socket.socket(fileno=int(sys.argv[-1]))
+settings = json.loads(link.recv(100000))
+def say(**values): link.send(json.dumps(values).encode())
+say(kind="ready", text="http://127.0.0.1:1")
+"""
+
+
+class Asked:
+    """Notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple] = []
+
+    def set_goal(self, goal):
+        if not np.isfinite(goal).all():
+            raise ValueError("goal")
+        self.calls.append(("goal", *goal.tolist()))
+
+    def estop(self, why):
+        self.calls.append(("estop",))
+
+    def __getattr__(self, name):
+        return lambda: self.calls.append((name,))
+
+
+def link_to(program: str, control=None, **settings) -> ViewerLink:
+    return ViewerLink(control or Asked(), 0.1, 0.3, program=(sys.executable, "-c", PREAMBLE + program), **settings)
+
+
+def record(index: int, **changes) -> TickRecord:
+    pixels = np.random.default_rng(index).random((80, 80)) > 0.5
+    plain = TickRecord(
+        index=index, time=0.1 * index, lateness=0.0, mode=Mode.RUNNING, frame=SensorFrame(0.1 * index),
+        occupancy=OccupancyMap(pixels), plan=np.full((10, 2), float(index)), replanned=True,
+    )  # fmt: skip
+    return replace(plain, **changes)
+
+
+def ticks_until(link: ViewerLink, done, limit: float = 30.0) -> int:
+    """Tick until something holds; how often."""
+    deadline, index = time.monotonic() + limit, 0
+    while not done():
+        assert time.monotonic() < deadline
+        link.tick(record(index))
+        index += 1
+        time.sleep(0.005)
+    return index
+
+
+def test_a_page_is_shown_ticks_as_they_are_and_its_wishes_are_granted(tmp_path):
+    out = tmp_path / "seen"
+    control, injected = Asked(), []
+    link = link_to(
+        f"""
+for kind in ("pause", "resume", "cancel", "acknowledge", "estop"): say(kind=kind)
+say(kind="goal", x=1.5, y=-2.0)
+say(kind="fault", text="flood")
+with open({str(out)!r}, "ab", buffering=0) as file:
+    while data := link.recv(1000000):
+        file.write(len(data).to_bytes(4, "little") + data)
+""",
+        control,
+        faults={"flood": lambda: injected.append(1)},
+    )
+    assert link.url == "http://127.0.0.1:1"
+    link.first_goal = np.array([0.5, 0.5])
+    ticks_until(link, lambda: injected and link.shown > 5)
+    link.close()
+    assert control.calls == [
+        ("goal", 0.5, 0.5), ("pause",), ("resume",), ("cancel",), ("acknowledge",), ("estop",), ("goal", 1.5, -2.0),
+    ]  # fmt: skip
+    decoder, data, read = messages.TickDecoder(), out.read_bytes(), []
+    while data:
+        size = int.from_bytes(data[:4], "little")
+        topic, _, body = data[4 : 4 + size].partition(b"\n")
+        read.append(decoder.add(messages.decode(topic.decode(), body)))
+        data = data[4 + size :]
+    read = [item for item in read if item is not None]
+    assert len(read) == link.shown
+    for item in read:
+        np.testing.assert_array_equal(item.occupancy.occupied, record(item.index).occupancy.occupied)
+        np.testing.assert_array_equal(item.plan, record(item.index).plan)
+
+
+def test_a_page_that_takes_nothing_any_more_misses_ticks_and_nobody_waits():
+    link = link_to("time.sleep(1000)")
+    for index in range(2000):
+        link.tick(record(index))
+    assert link.dropped > 1000 and link.shown > 0
+    link._process.kill()
+    link.close()
+
+
+def test_a_page_that_floods_is_heard_a_few_times_a_tick():
+    control = Asked()
+    link = link_to(
+        """
+link.setblocking(True)
+for k in range(3000):
+    say(kind="goal", x=float(k), y=0.0)
+    link.send(b"\\xff{nonsense")
+    say(kind="self-destruct")
+    say(kind="fault", text="unknown")
+    say(kind="goal", x=float("nan"), y=0.0)
+time.sleep(1000)
+""",
+        control,
+    )
+    for index in range(200):
+        calls, refused = len(control.calls), link.refused
+        link.tick(record(index))
+        assert len(control.calls) - calls + link.refused - refused <= COMMANDS_PER_TICK
+        time.sleep(0.001)
+    assert {call[0] for call in control.calls} == {"goal"} and len(control.calls) > 20
+    assert link.refused > 80
+    link._process.kill()
+    link.close()
+
+
+def test_a_page_that_dies_is_forgotten():
+    link = link_to("raise SystemExit")
+    ticks_until(link, lambda: link._socket is None)
+    link.tick(record(0))
+    link.close()
+
+
+def test_a_page_that_was_too_slow_is_shown_map_and_plan_again():
+    """What it missed may have been a map or a plan that later ticks refer to."""
+    link = link_to(
+        """
+time.sleep(1.0)
+while data := link.recv(1000000): pass
+"""
+    )
+    still = record(0).occupancy
+    sent: list[str] = []
+    send = link._send
+    link._send = lambda topic, data: sent.append(topic) or send(topic, data)
+    ticks = 0
+    while link.dropped == 0:
+        link.tick(record(ticks, occupancy=still))
+        ticks += 1
+    assert sent.count("/map") == 1
+    sent.clear()
+    ticks_until(link, lambda: link.shown and "/tick" in sent)
+    assert "/map" in sent and "/plan" in sent
+    link.close()
+
+
+@pytest.mark.parametrize("program", ["raise SystemExit", "import os; os._exit(3)"])
+def test_a_page_that_does_not_come_up_is_said_so_before_the_robot_moves(program):
+    with pytest.raises(ValueError, match="does not come up"):
+        ViewerLink(Asked(), 0.1, 0.3, program=(sys.executable, "-c", program))
+
+
+def test_a_large_map_is_made_coarser_and_loses_no_obstacle():
+    pixels = np.zeros((3000, 2000), dtype=bool)
+    pixels[1234, 777] = pixels[-1, -1] = True
+    large = OccupancyMap(pixels, 0.05, (-3.0, 4.0))
+    coarse = coarser(large, 1_000_000)
+    assert coarse.occupied.size < 1_100_000
+    for row, column in np.argwhere(pixels):
+        point = (-3.0 + 0.05 * (column + 0.5), 4.0 + 0.05 * (row + 0.5))
+        assert coarse.occupied_at(point)
+    link = link_to("time.sleep(1000)")
+    link.tick(record(0, occupancy=large))
+    deadline = time.monotonic() + 30.0
+    while link._coarse is None or link._coarse[1] is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert link._with_coarse_map(record(1), large).occupancy.occupied.size < 1_100_000
+    link._process.kill()
+    link.close()

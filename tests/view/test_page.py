@@ -1,0 +1,149 @@
+"""The live page in a real browser: it loads, the robot moves on it, and a click sets the goal."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from hiernav.view.commands import Command, Settings
+
+SCRIPT = Path(__file__).parents[2] / "deploy" / "run_loop.py"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="needs viser: pip install 'hiernav[view]'")
+WAIT = 300.0
+"""A browser that draws in software takes its time on a busy machine [s]."""
+
+
+@pytest.fixture
+def browser(tmp_path):
+    """Chromium without a screen, driven by selenium."""
+    if find_spec("selenium") is None:
+        pytest.skip("needs selenium: pip install 'hiernav[dev]'")
+    binary = next(filter(None, map(shutil.which, BROWSERS)), None)
+    driver = shutil.which("chromedriver")
+    if binary is None or driver is None:
+        pytest.skip("needs a browser: apt-get install chromium chromium-driver")
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    for flag in (
+        "headless", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
+        "disable-component-update", "disable-sync", "use-gl=angle", "use-angle=swiftshader",
+        "enable-unsafe-swiftshader", "window-size=900,600", f"user-data-dir={tmp_path / 'browser'}",
+    ):  # fmt: skip
+        options.add_argument(f"--{flag}")
+    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    browser.set_script_timeout(WAIT)
+    browser.set_page_load_timeout(WAIT)
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A robot in an empty world, driven in real time with a live page; the page's address."""
+    environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1])}
+    process = subprocess.Popen(
+        [sys.executable, str(SCRIPT), "--view", "0", "--world", "pillar(2,2,0)", "--goal=1.5,1.5", "--no-pictures",
+         "--out", str(tmp_path / "out")],
+        stdout=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    line = process.stdout.readline()
+    assert line.startswith("live page: http://127.0.0.1:"), line
+    yield line.split()[-1]
+    process.send_signal(signal.SIGINT)
+    assert process.wait(WAIT) == 0
+    episode = json.loads((tmp_path / "out" / "summary.json").read_text())["episodes"][0]
+    assert episode["stopped"]
+
+
+def until(value: Callable[[], object], what: str) -> object:
+    """The first answer that is true."""
+    deadline = time.monotonic() + WAIT
+    while not (answer := value()):
+        assert time.monotonic() < deadline, what
+        time.sleep(0.2)
+    return answer
+
+
+@needs_viser
+@pytest.mark.slow
+def test_the_page_loads_the_robot_moves_and_a_click_sets_the_goal(robot, browser):
+    browser.get(robot)
+
+    def numbers(name: str) -> tuple[float, float] | None:
+        text = browser.execute_script("return document.body.innerText")
+        found = re.search(rf"{name} x (-?[\d.]+) y (-?[\d.]+)", text)
+        return (float(found[1]), float(found[2])) if found else None
+
+    began = until(lambda: numbers("position"), "the page shows no position")
+    until(lambda: math.dist(numbers("position"), (1.5, 1.5)) < 0.8, "the robot does not arrive at its first goal")
+    until(lambda: browser.execute_script("return document.querySelectorAll('canvas').length"), "there is no canvas")
+
+    # the middle of the scene, which the camera aims at, is the middle of the field
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    size = browser.execute_script("return [window.innerWidth, window.innerHeight]")
+    ActionChains(browser).move_by_offset(size[0] // 2, size[1] // 2).click().perform()
+    until(lambda: math.dist(numbers("position"), (0.0, 0.0)) < 0.8, "the robot does not go where was clicked")
+    assert math.dist(began, numbers("position")) > 0.3
+    events = browser.execute_script("return document.body.innerText")
+    goals = [tuple(map(float, pair)) for pair in re.findall(r"goal (-?[\d.]+), (-?[\d.]+)", events)]
+    assert any(math.dist(goal, (0.0, 0.0)) < 0.3 for goal in goals), events
+
+
+@needs_viser
+def test_a_click_is_where_its_ray_meets_the_floor():
+    from hiernav.view.page import on_floor
+
+    assert on_floor((1.0, 2.0, 4.0), (0.0, 0.6, -0.8)) == pytest.approx((1.0, 5.0))
+    assert on_floor((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) is None
+    assert on_floor((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)) is None
+    assert on_floor((0.0, 0.0, -1.0), (0.0, 0.0, -1.0)) is None
+
+
+@needs_viser
+@pytest.mark.slow
+def test_the_page_is_for_this_machine_and_for_its_own_site_only(tmp_path):
+    """It listens on 127.0.0.1 alone, and refuses what a page of another site, in the same browser, would send."""
+    import websockets.sync.client as client
+    from websockets.exceptions import InvalidHandshake
+
+    from hiernav.view.link import ViewerLink
+
+    link = ViewerLink(object(), 0.1, 0.3, port=0)
+    try:
+        port = int(link.url.rpartition(":")[2])
+        local = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+        assert f"0100007F:{port:04X}" in local and f"00000000:{port:04X}" not in local
+        assert b"<html" in urllib.request.urlopen(link.url, timeout=60).read(2000).lower()
+        version = client.Subprotocol(f"viser-v{__import__('viser').__version__}")
+        address = f"ws://127.0.0.1:{port}"
+        with pytest.raises(InvalidHandshake):
+            client.connect(address, origin="http://elsewhere.example", subprotocols=[version])
+        with client.connect(address, origin=link.url, subprotocols=[version]) as connection:
+            assert connection.recv(timeout=60)
+    finally:
+        link.close()
+
+
+def test_what_is_said_over_the_socket_is_small():
+    import msgspec
+
+    assert len(msgspec.json.encode(Settings("t" * 100, 0.1, 0.3, 8080, ("x" * 50,) * 20))) < 2000
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.json.decode(msgspec.json.encode(Command("fault", text="x" * 201)), type=Command)
