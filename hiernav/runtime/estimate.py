@@ -105,4 +105,5 @@ class Estimate:
     why: str = ""
     """What the estimate suffers from, where it is not good."""
     restarts: int = 0
-    """How often position or heading were started again, as after being carried away. Plans made before are void."""
+    """How often position or heading were far off (`reinit_spread`) and started again, as after being carried away.
+    Plans made before are void."""

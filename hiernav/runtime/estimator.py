@@ -40,7 +40,8 @@ class Estimator:
     def reset(self) -> None:
         """Forget the state, as after being carried away. Counts are kept."""
         config = self.config
-        self._filter = PlanarFilter(config.velocity_walk, config.bias_walk)
+        # A body that shivers at rest, sampled in step with it, would otherwise pass for a gyro of any bias.
+        self._filter = PlanarFilter(config.velocity_walk, config.bias_walk, 3.0 * config.bias_sigma)
         self._filter.replace(VELOCITY, (0.0, 0.0), 1.0)
         self._filter.replace(slice(BIAS, BIAS + 1), (0.0,), config.bias_sigma**2)
         self._tilt = TiltFilter(
@@ -258,7 +259,8 @@ class Estimator:
         if self._rejected[sensor] < patience or not agrees:
             return False
         self.counts[f"{sensor}_reinit"] += 1
-        self._restarts += sensor in ("position_fix", "magnetometer")
+        moved = math.hypot(*miss) > self.config.reinit_spread
+        self._restarts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
     def _trust(self) -> tuple[Trust, str]:

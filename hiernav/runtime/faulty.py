@@ -15,7 +15,7 @@ Damage = Callable[[SensorFrame, SensorFrame, np.random.Generator], SensorFrame]
 
 
 def _silent(frame: SensorFrame, began: SensorFrame, rng: np.random.Generator) -> SensorFrame:
-    return replace(frame, **dict.fromkeys(VECTOR_SENSORS), position_fix=None, fix_stamp=None)
+    return SensorFrame(frame.stamp, lidar=frame.lidar, extra=frame.extra)
 
 
 def _no_fix(frame: SensorFrame, began: SensorFrame, rng: np.random.Generator) -> SensorFrame:

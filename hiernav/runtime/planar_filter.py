@@ -20,11 +20,12 @@ class PlanarFilter(ExtendedKalmanFilter):
     base class take. A measurement must pass a chi-square gate before it may touch the state.
     """
 
-    def __init__(self, velocity_walk: float, bias_walk: float) -> None:
+    def __init__(self, velocity_walk: float, bias_walk: float, max_bias: float = math.inf) -> None:
         """
         Args:
             velocity_walk: random walk of the velocity [m/s per sqrt(s)].
             bias_walk: random walk of the gyro's bias [rad/s per sqrt(s)].
+            max_bias: no gyro's bias is larger [rad/s].
         """
         super().__init__(dim_x=6, dim_z=2)
         self.x = np.zeros(6)
@@ -32,6 +33,7 @@ class PlanarFilter(ExtendedKalmanFilter):
         self.Q = np.zeros((6, 6))
         self._velocity_density = velocity_walk**2
         self._bias_density = bias_walk**2
+        self._max_bias = max_bias
 
     @property
     def yaw(self) -> float:
@@ -117,6 +119,7 @@ class PlanarFilter(ExtendedKalmanFilter):
     def _apply(self, change: np.ndarray, reduction: np.ndarray) -> None:
         self.x = self.x + change
         self.x[YAW] = wrap(float(self.x[YAW]))
+        self.x[BIAS] = min(max(float(self.x[BIAS]), -self._max_bias), self._max_bias)
         covariance = self.P - reduction
         self.P = 0.5 * (covariance + covariance.T)
 

@@ -50,7 +50,7 @@ class Page:
         self._last: tuple[int, float] | None = None
         self._rate = 0.0
         self._shown = 0
-        self._events: deque[str] = deque(maxlen=6)
+        self._events: deque[str] = deque(maxlen=12)
         self._paused = False
         self._make_scene()
         self._make_panel()

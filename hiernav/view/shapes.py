@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hiernav.nav.lidar import LIDAR_BINS
 from hiernav.nav.occupancy import OccupancyMap
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 LIDAR_REACH = 3.0
 """Distances are drawn up to this [m]."""
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +18,7 @@ from hiernav.runtime.guard import GuardConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
+from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise, SimRobot
 from hiernav.sim.layout import GOAL_RADIUS, parse_world
 from hiernav.sim.robots import get_robot
@@ -62,12 +66,17 @@ def drive(
     world: str = "pillar(2,2,10)",
     max_steps: int | None = None,
     noise: SensorNoise | None = None,
+    damage: Callable[[SensorFrame], SensorFrame] = lambda frame: frame,
+    pinned_from: float = math.inf,
 ) -> RunResult:
-    """Drive the point robot through one world, told to `observers`."""
+    """Drive the point robot through one world, told to `observers`.
+
+    `damage` is done to every frame; from the time `pinned_from` [s] on no command reaches the robot.
+    """
     spec, layout = get_robot("point"), sample_layout(parse_world(world), seed, get_robot("point").radius)
     robot = SimRobot(spec, layout, noise, seed)
     driver = Driver(
-        robot,
+        _Hindered(robot, damage, pinned_from),
         Pilot(make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS)),
         robot.occupancy,
         FakeClock(),
@@ -79,6 +88,22 @@ def drive(
         return driver.run(layout.goal, max_steps)
     finally:
         robot.close()
+
+
+class _Hindered:
+    def __init__(self, robot: SimRobot, damage: Callable[[SensorFrame], SensorFrame], pinned_from: float) -> None:
+        self._robot, self._damage, self._pinned_from = robot, damage, pinned_from
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._robot, name)
+
+    def read(self) -> SensorFrame:
+        return self._damage(self._robot.read())
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        pinned = self._robot.truth().time >= self._pinned_from
+        sent = self._robot.send(np.zeros_like(action) if pinned else action)
+        return action if pinned else sent
 
 
 def equal(a: object, b: object) -> bool:

@@ -222,6 +222,21 @@ def test_a_biased_gyro_is_learnt():
     assert errors.yaw_rms < math.radians(2.0)
 
 
+def test_a_body_that_shivers_at_rest_is_not_taken_for_a_biased_gyro():
+    """Sampled in step with the shiver, the gyro reads a turn that never happens; then the robot drives on."""
+    motion = recorded("point")
+    rest = 150
+    still = {name: np.concatenate([np.repeat(v[:1], rest, 0), v]) for name, v in motion.sensors.items()}
+    still["gyro"][:rest, 2] += 0.48
+    poses = np.concatenate([np.repeat(motion.poses[:1], rest, 0), motion.poses])
+    stamps = np.arange(len(poses)) * motion.stamps[1]
+    shivering = replace(motion, stamps=stamps, poses=poses, upright=np.ones(len(poses)), sensors=still)
+    errors = follow(shivering, estimator_for(motion), frames(shivering))
+    assert np.abs(errors.yaw).max() < math.radians(8.0)
+    assert np.sqrt(np.mean(errors.yaw[rest + 50 :] ** 2)) < math.radians(3.0)
+    assert errors.estimates[-1].restarts == 0
+
+
 def test_nothing_is_claimed_before_position_and_heading_are_measured():
     estimator = Estimator()
     still = {"accelerometer": np.array([0, 0, 9.81]), "gyro": np.zeros(3), "velocimeter": np.zeros(3)}

@@ -19,6 +19,7 @@ from hiernav.runtime.recorder import Recorder
 from hiernav.runtime.replay import Replay
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise
+from hiernav.runtime.supervisor import Mode
 
 
 def recorded(path, *runs, change=lambda record: record):
@@ -51,6 +52,18 @@ def test_everything_that_was_decided_is_decided_again_bit_for_bit(tmp_path, bund
     assert result.ticks == sum(1 for _ in log.ticks())
     assert result.compared["estimate"] == result.ticks
     assert result.compared["proposed"] == result.compared["plan"] > 150
+    assert result.compared["sent"] > 150
+
+
+def test_waiting_and_recovering_are_replayed_too(tmp_path, bundle):
+    def blink(frame):
+        return SensorFrame(frame.stamp, lidar=frame.lidar) if 0.5 < frame.stamp < 0.9 else frame
+
+    log = recorded(tmp_path / "hard.mcap", {"seed": 1, "damage": blink}, {"seed": 4, "pinned_from": 0.6})
+    modes = {tick.mode for tick in log.ticks()}
+    assert {Mode.HOLD, Mode.RECOVERING} <= modes
+    result = Replay(log, bundle).compare()
+    assert result.equal, result.difference
     assert result.compared["sent"] > 150
 
 
