@@ -16,7 +16,9 @@ The peers, in an environment of their own:
 from __future__ import annotations
 
 import argparse
+import atexit
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -45,7 +47,9 @@ def hiernav(hidden: int, precision: str = "auto") -> Burst:
 
     settings = SacSettings(hidden=(hidden, hidden), precision=precision)
     learner = Learner(observation_layout("doggo"), ACTIONS, settings)
-    replay = Replay(Path(tempfile.mkdtemp(prefix="hiernav-bench-")), STORED, OBSERVATION, ACTIONS, BATCH)
+    folder = tempfile.mkdtemp(prefix="hiernav-bench-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    replay = Replay(Path(folder) / "replay", STORED, OBSERVATION, ACTIONS, BATCH)
     replay.extend(TensorDict(torch_transitions(), [STORED]))
     return lambda: [learner.update(replay.sample()) for _ in range(BURST)]
 
