@@ -264,6 +264,7 @@ class Episodes:
             Estimator(settings.estimator),
             Guard(spec.action_dim, guard),
             replace(settings.driver, max_steps=self.layout.spec.max_steps),
+            rehearsal=0.0 if arguments.fast else settings.realtime.rehearsal,
         )
         self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
         self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)

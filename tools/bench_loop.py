@@ -34,13 +34,15 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="of that run (60)")
     parser.add_argument("--hogs", type=int, default=0, help="processes that compute beside that run (0)")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="of the point robot")
+    parser.add_argument("--rehearsal", type=float, default=0.002, help="before each tick [s]; 0 for none (0.002)")
     parser.add_argument("--normal", action="store_true", help="ask for no real-time scheduling")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
     if arguments.rate is None:
         found = bench_loop(arguments.bundle, arguments.normal)
     else:
-        found = [measure(arguments.rate, arguments.seconds, arguments.hogs, arguments.bundle, arguments.normal)]
+        settings = (arguments.seconds, arguments.hogs, arguments.bundle, arguments.normal, arguments.rehearsal)
+        found = [measure(arguments.rate, *settings)]
         show(found[0])
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=2) + "\n")
@@ -60,7 +62,9 @@ def bench_loop(bundle: Path, normal: bool = False) -> list[dict[str, Any]]:
     return results
 
 
-def measure(rate: int, seconds: float, hogs: int, bundle_path: Path, normal: bool) -> dict[str, Any]:
+def measure(
+    rate: int, seconds: float, hogs: int, bundle_path: Path, normal: bool, rehearsal: float = 0.002
+) -> dict[str, Any]:
     """Drive for some time; all figures in seconds, megabytes and shares."""
     from hiernav.nav.bundle import load_bundle
     from hiernav.runtime.clock import MonotonicClock
@@ -86,7 +90,9 @@ def measure(rate: int, seconds: float, hogs: int, bundle_path: Path, normal: boo
     pilot = Pilot(make_agent(bundle, 0.1, planner=link), link)
     guard = Guard(2, GuardConfig(slow_ttc=0.3, slowed=(0,)))
     estimator, config = Estimator(EstimatorConfig(tilts=False)), DriverConfig(max_steps=10**9)
-    driver = Driver(robot, pilot, lambda stamp: occupancy, MonotonicClock(), estimator, guard, config)
+    driver = Driver(
+        robot, pilot, lambda stamp: occupancy, MonotonicClock(), estimator, guard, config, rehearsal=rehearsal
+    )
     free = occupancy.pixel_centers()[occupancy.clearance > 0.3]
     rng = np.random.default_rng(0)
     facts: dict[str, Any] = {"goals": 0, "faults": 0}

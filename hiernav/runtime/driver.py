@@ -21,6 +21,7 @@ from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
 from hiernav.runtime.observe import Audience, Observer, TickRecord
 from hiernav.runtime.pilot import Decision, Pilot
+from hiernav.runtime.rehearsal import Rehearsal
 from hiernav.runtime.robot import Robot, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
@@ -97,6 +98,7 @@ class Driver:
         config: DriverConfig | None = None,
         timer: TickTimer | None = None,
         observers: Sequence[Observer] = (),
+        rehearsal: float = 0.0,
     ) -> None:
         """
         Args:
@@ -106,6 +108,8 @@ class Driver:
             clock: paces the loop.
             estimator, guard, config, timer: defaults if None.
             observers: told of every tick and event; one that raises is dropped.
+            rehearsal: how long before each tick one is rehearsed to warm the caches [s]; 0, or a period of less than
+                four times that, does without.
         """
         self.robot, self.pilot, self.occupancy, self.clock = robot, pilot, occupancy, clock
         self.estimator = estimator or Estimator()
@@ -114,7 +118,9 @@ class Driver:
         self.timer = timer or TickTimer(SECTIONS)
         self.audience = Audience(observers)
         self.supervisor = Supervisor(lambda now, mode, why: self._emit("mode", why, now, mode=mode.value))
-        self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake)
+        prepare = self._rehearse if 0.0 < 4.0 * rehearsal <= robot.control_period else None
+        self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake, prepare=prepare, lead=rehearsal)
+        self._rehearsal: Rehearsal | None = None
         self.interrupted = False
         """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
         self.last_result: RunResult | None = None
@@ -204,6 +210,7 @@ class Driver:
         self._trip, self._ended, self._paused = None, None, False
         self._estimate, self._restarts = None, 0
         self._last_frame: SensorFrame | None = None
+        self._occupancy: OccupancyMap | None = None
         self._loop_ticks = self.loop.ticks
         self._terms = TermHold()
         config, trust = self.config, self.estimator.config
@@ -230,6 +237,23 @@ class Driver:
                 self.last_result = self._result(self._ended, stopped)
             if not self.supervisor.latched and self.supervisor.mode is not Mode.INIT:
                 self.supervisor.change(Mode.INIT, "the loop has ended", self.clock.now())
+
+    def _rehearse(self) -> None:
+        """Touch what the next tick will need. Whatever goes wrong here must not go wrong there."""
+        trip, frame, estimate, occupancy = self._trip, self._last_frame, self._estimate, self._occupancy
+        if trip is None or frame is None or estimate is None or occupancy is None:
+            return
+        try:
+            if self._rehearsal is None:
+                agent, radius = self.pilot.agent, self.config.robot_radius
+                self._rehearsal = Rehearsal(agent, self.estimator.config, self.guard, radius)
+            rehearse = getattr(self.robot, "rehearse", None)
+            if rehearse is not None:
+                rehearse()
+            self._rehearsal(frame, estimate, trip.goal, occupancy)
+        except Exception:
+            log.exception("the rehearsal failed and is dropped")
+            self.loop.drop_preparation()
 
     def _tick(self, now: float) -> bool:
         """One control step; True when the run is over. What goes wrong in it is a fault, not an exception."""
@@ -263,7 +287,7 @@ class Driver:
         if trust is Trust.LOST and self._trip is not None:
             self._fail(doubt, now)
         if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
-            occupancy = self.occupancy(frame.stamp)
+            occupancy = self._occupancy = self.occupancy(frame.stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
                 decision = self._decide(self._trip, frame, estimate, occupancy, now)

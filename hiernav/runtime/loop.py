@@ -42,6 +42,8 @@ class FixedRateLoop:
         tick: Callable[[float], bool],
         brake: Callable[[], None],
         handle_signals: bool = True,
+        prepare: Callable[[], None] | None = None,
+        lead: float = 0.0,
     ) -> None:
         """
         Args:
@@ -50,6 +52,8 @@ class FixedRateLoop:
             tick: called with the time [s]; returns True when the loop is done.
             brake: stops the robot.
             handle_signals: turn SIGINT and SIGTERM into an interruption while the loop runs in the main thread.
+            prepare: called just early enough before a deadline to be done by then, where there is time.
+            lead: time before the deadline at which it is begun at most [s].
 
         Raises:
             ValueError: `period` is not a finite positive number.
@@ -71,6 +75,7 @@ class FixedRateLoop:
         self._tick = tick
         self._brake = brake
         self._handle_signals = handle_signals
+        self._prepare, self._lead, self._ahead = prepare, lead, lead
         self._leaving = True
         self._signalled = False
         self._stopped = False
@@ -78,6 +83,10 @@ class FixedRateLoop:
     def stop(self) -> None:
         """Leave the loop after the present tick. May be called from any thread."""
         self._stopped = True
+
+    def drop_preparation(self) -> None:
+        """Do without `prepare` from now on."""
+        self._prepare = None
 
     def run(self) -> LoopExit:
         """Run until `tick` returns True, `stop` is called, or a signal or exception arrives.
@@ -108,6 +117,13 @@ class FixedRateLoop:
         index = 0
         while not self._stopped:
             deadline = start + index * self.period
+            if self._prepare is not None and self.clock.now() < deadline - self._ahead:
+                self.clock.sleep_until(deadline - self._ahead)
+                began = self.clock.now()
+                self._prepare()
+                # as late as it may be begun: what lies between would only get cold again
+                longest = max(self.clock.now() - began + 1e-4, 0.95 * self._ahead)
+                self._ahead = min(longest, self._lead)
             self.clock.sleep_until(deadline)
             now = self.clock.now()
             self.phase_error = math.remainder(deadline - start, self.period)

@@ -249,3 +249,25 @@ def test_five_milliseconds_are_kept_on_a_real_clock():
     elapsed = clock.now() - start
     assert elapsed == pytest.approx((299 + loop.overruns) * 0.005, abs=0.005)
     assert loop.lateness.percentile(50) < 0.001
+
+
+def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_has_no_time_for_it():
+    clock = FakeClock()
+    prepared: list[float] = []
+    ticks: list[float] = []
+
+    def prepare() -> None:
+        prepared.append(clock.now())
+        clock.advance(0.01)
+
+    def tick(now: float) -> bool:
+        ticks.append(now)
+        clock.advance(0.24 if len(ticks) == 4 else 0.01)
+        return len(ticks) == 200
+
+    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=prepare, lead=0.05)
+    loop.run()
+    assert ticks == [k * PERIOD for k in range(200)] and loop.overruns == 0
+    assert len(prepared) == 198  # before the first tick and after the long one there was no time
+    assert prepared[0] == pytest.approx(PERIOD - 0.05)
+    assert prepared[-1] == pytest.approx(199 * PERIOD - 0.0101, abs=1e-3)
