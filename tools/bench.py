@@ -6,7 +6,8 @@
     --peers   SAC updates/s beside torchrl's plain loop, Stable-Baselines3 and SBX (see tools/sac_peers.py); on request
     --tick    cost of one control step on the robot side, by section
     --loop    the real-time loop in its three processes, 3 minutes (see tools/bench_loop.py); on request
-    --plan    cost of a shortest-path field, a GOSELO image and the planner network
+    --plan    cost of a plan and of a labelled sample, and of what they are made of
+    --learn   samples/s that the planner network learns from, against plain float32
 
 All but --peers and --loop by default. Close other programs first: ratios survive a busy machine, figures do not.
 """
@@ -17,20 +18,17 @@ import argparse
 import json
 import platform
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from bench_env import bench_env
 from bench_loop import bench_loop
+from bench_plan import bench_learn, bench_plan
 from bench_updates import bench_peers, bench_update
-from race import timed
 
-PARTS = ("env", "update", "peers", "tick", "loop", "plan")
+PARTS = ("env", "update", "peers", "tick", "loop", "plan", "learn")
 ON_REQUEST = ("peers", "loop")
 
 
@@ -89,49 +87,6 @@ def bench_tick(arguments: argparse.Namespace) -> dict[str, Any]:
     return sections
 
 
-def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
-    """One row at a time, as on the robot."""
-    from hiernav.nav import goselo
-    from hiernav.nav.bundle import load_bundle
-    from hiernav.nav.occupancy import VisitMap
-    from hiernav.nav.search import PathField
-    from hiernav.runtime.policy import load_policies
-    from hiernav.sim.layout import parse_world
-    from hiernav.sim.worlds import sample_layout
-
-    bundle = load_bundle(arguments.bundle)
-    network, channels = load_policies(bundle).planner, bundle.manifest.goselo.channels
-    layouts = [sample_layout(parse_world("pillar(2,2,10)"), seed) for seed in range(32)]
-    maps = [layout.occupancy(0.0) for layout in layouts]
-    visits = [VisitMap(occupancy) for occupancy in maps]
-    frames = [goselo.GoseloFrame.of(layout.start[None, :2], layout.goal[None]) for layout in layouts]
-    images = [goselo.images([m], [v], f, channels) for m, v, f in zip(maps, visits, frames, strict=True)]
-    fields = [PathField(m, layout.goal, 0.1, 0.15) for m, layout in zip(maps, layouts, strict=True)]
-    turn = iter(range(10**9))
-
-    def each(call: Callable[[int], Any]) -> Callable[[], int]:
-        def run() -> int:
-            call(next(turn) % len(layouts))
-            return 1
-
-        return run
-
-    parts = {
-        "field": each(lambda k: PathField(maps[k], layouts[k].goal, 0.1, 0.15)),
-        "waypoints": each(lambda k: fields[k].waypoints(layouts[k].start[:2])),
-        "image_paper": each(lambda k: goselo.images([maps[k]], [visits[k]], frames[k])),
-        "image": each(lambda k: goselo.images([maps[k]], [visits[k]], frames[k], channels)),
-        "network": each(lambda k: network(images[k], frames[k].distance.astype(np.float32))),
-    }
-    results = {}
-    for name, run in parts.items():
-        timed(run, 0.1)
-        count, seconds = timed(run, arguments.seconds / 4)
-        results[name] = seconds / count
-        print(f"plan {name:12s} {1e3 * seconds / count:7.3f} ms   {count / seconds:8,.0f}/s")
-    return results
-
-
 BENCHES: dict[str, Callable[[argparse.Namespace], Any]] = {
     "env": bench_env,
     "update": bench_update,
@@ -139,6 +94,7 @@ BENCHES: dict[str, Callable[[argparse.Namespace], Any]] = {
     "tick": bench_tick,
     "loop": lambda arguments: bench_loop(arguments.bundle),
     "plan": bench_plan,
+    "learn": bench_learn,
 }
 
 

@@ -41,6 +41,8 @@ Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 _VALIDATION = 2000
 _VALIDATION_SEED = 0xE7A1
 _WALKS = 200
+_CHECKPOINTS = 25
+"""Validations and checkpoints of a training are at least so many, as far as it has as many epochs."""
 _OTHER_HYPOTHESES = 0.05
 """Share of the loss that hypotheses which are not the best one keep, so that none dies."""
 
@@ -59,7 +61,7 @@ class Progress:
 
 
 class PlannerTrainer:
-    """One training of the waypoint generator within a run folder; checkpointed after every epoch."""
+    """One training of the waypoint generator within a run folder; checkpointed after every epoch, or every few of many."""
 
     def __init__(self, config: TrainConfig, run: Run) -> None:
         self.config, self.run = config, run
@@ -138,6 +140,8 @@ class PlannerTrainer:
             loss = self._epoch(samples, lambda done, now: report("training", done, total, first, now))
             rate = len(samples) / (time.perf_counter() - started)
             self.epoch += 1
+            if self.epoch % max(1, planner.epochs // _CHECKPOINTS) and not self.finished:
+                continue  # small sets are seen so often that looking at each pass would take longer than the passes
             self.validation = {"loss": loss, **self._validate(held_out)}
             if self.finished:
                 self.validation |= self._walk()
