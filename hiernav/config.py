@@ -35,7 +35,7 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """The waypoint generator: its data set, its network and its training (method sections 4 and 5)."""
 
     preset: Annotated[Literal["default", "paper"], Meta(description="`paper`: the published network.")] = "default"
-    samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 40_000
+    samples: Annotated[int, Meta(ge=1, description="Size of the data set.")] = 60_000
     data: Annotated[
         Annotated[str, Meta(min_length=1)] | None,
         Meta(description="Folder that `hiernav dataset` has made to take them from; null: make them for the run."),
@@ -67,7 +67,13 @@ class PlannerConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     worlds: Annotated[
         tuple[MixEntry, ...],
         Meta(min_length=1, description="Worlds the samples are drawn from, each as often as its weight says."),
-    ] = ("pillar(2,2,10)",)
+    ] = (
+        "3*pillar(2,2,10)",
+        "2*pillar(2..8,2..8,0.4..0.65/m2)",
+        "gremlin(2..4,2..4,0.3..0.6/m2)",
+        "two-room(2..4,2..4)",
+        "four-room(2..4,2..4)",
+    )
 
 
 class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -225,6 +231,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "heading_weight": 0.0,
             "mirror": False,
             "soft_margin_m": 0.0,
+            "worlds": ["pillar(2,2,10)"],
         },
     },
     "skill": {
