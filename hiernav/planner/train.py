@@ -61,7 +61,7 @@ class Progress:
 
 
 class PlannerTrainer:
-    """One training of the waypoint generator within a run folder; checkpointed after every epoch, or every few of many."""
+    """One training of the waypoint generator within a run folder; checkpointed after every epoch, or few of many."""
 
     def __init__(self, config: TrainConfig, run: Run) -> None:
         self.config, self.run = config, run
