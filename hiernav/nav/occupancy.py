@@ -121,6 +121,12 @@ class VisitMap:
         self._extent = occupancy.extent
         self._last_pixel: tuple[int, int] | None = None
 
+    def copy(self) -> VisitMap:
+        """The visits so far."""
+        copied = VisitMap.__new__(VisitMap)
+        copied.__dict__.update(self.__dict__, counts=self.counts.copy())
+        return copied
+
     def add(self, positions: ArrayLike) -> None:
         """Follow the robot along positions (2,) or (M, 2), in order of time, world frame [m].
 

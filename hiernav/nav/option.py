@@ -110,6 +110,17 @@ class PlanQuery:
     """(M, K, 2) plan that is being replaced, NaN where there is none."""
 
 
+def kept(query: PlanQuery) -> PlanQuery:
+    """The query as it is now, of which nothing is written again."""
+    return PlanQuery(
+        query.position.copy(),
+        query.goal.copy(),
+        list(query.occupancy),
+        [visits.copy() for visits in query.visits],
+        query.previous.copy(),
+    )
+
+
 class Planner(Protocol):
     """Proposes waypoints. A row of NaN says that no plan was found."""
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hiernav.nav.bundle import Bundle
-from hiernav.nav.occupancy import OccupancyMap, VisitMap
-from hiernav.nav.option import Planner, PlanQuery
+from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.option import Planner, PlanQuery, kept
 from hiernav.nav.recovery import Recovery
 from hiernav.runtime.about import About
 from hiernav.runtime.estimate import Estimate
@@ -221,20 +221,7 @@ class _Asked(Planner):
         if len(self._order) == ASKED:
             del self.queries[self._order.popleft()]
         self._order.append(self.stamp)
-        self.queries[self.stamp] = PlanQuery(
-            query.position.copy(),
-            query.goal.copy(),
-            list(query.occupancy),
-            [_copy(visits) for visits in query.visits],
-            query.previous.copy(),
-        )
-
-
-def _copy(visits: VisitMap) -> VisitMap:
-    copied = VisitMap.__new__(VisitMap)
-    copied.__dict__.update(visits.__dict__)
-    copied.counts = visits.counts.copy()
-    return copied
+        self.queries[self.stamp] = kept(query)
 
 
 def _state(estimate: Estimate | None) -> object:

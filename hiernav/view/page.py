@@ -26,7 +26,7 @@ TEXT_EVERY = 5
 """Ticks shown between two updates of the text."""
 MAP, ROBOT, TRUTH, PLAN, GOAL, TRAIL, LIDAR, ELLIPSE = (
     (110, 118, 130), (31, 98, 196), (70, 170, 90), (225, 120, 30), (200, 40, 60), (60, 60, 70), (150, 90, 200),
-    (31, 98, 196),
+    (255, 205, 40),
 )  # fmt: skip
 
 
@@ -94,6 +94,7 @@ class Page:
         # Pictures of surroundings would come from the internet, and shadows take longer than all the rest.
         scene.configure_environment_map(None)
         scene.configure_default_lights(cast_shadow=False)
+        scene.add_light_ambient("/light", intensity=1.5)
         for name, color, wide, high in (("/truth", TRUTH, 1.2, 0.3), ("/robot", ROBOT, 1.0, 1.0)):
             scene.add_frame(name, show_axes=False, visible=False)
             height = high * ROBOT_HEIGHT
@@ -147,10 +148,11 @@ class Page:
             self._aim((0.5 * (xmin + xmax), 0.5 * (ymin + ymax)), max(xmax - xmin, ymax - ymin))
 
     def _aim(self, center: tuple[float, float], size: float) -> None:
-        """Look at the whole field from above, a little from the south."""
+        """Look at the whole field from above, a little from the south, and leave room for the panel on the right."""
         floor = self.server.scene.add_grid("/floor", size, size, cell_size=0.5, plane="xy", infinite_grid=False)
         floor.position = (*center, -0.005)
-        position, look_at = (center[0], center[1] - 0.45 * size, 0.8 * size), (*center, 0.0)
+        aim = center[0] + 0.12 * size
+        position, look_at = (aim, center[1] - 0.45 * size, 0.8 * size), (aim, center[1], 0.0)
         initial = self.server.initial_camera
         initial.position, initial.look_at, initial.up = position, look_at, (0.0, 0.0, 1.0)
         for client in self.server.get_clients().values():
