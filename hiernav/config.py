@@ -28,6 +28,7 @@ _MIX_HELP = _WORLD_HELP + "; with ranges and a weight: 2*pillar(2..8,2..8,0.4..0
 MixEntry = Annotated[str, Meta(pattern=_MIX_PATTERN, extra={"accepts": _MIX_HELP})]
 Precision = Literal["auto", "float32", "bfloat16"]
 Device = Literal["auto", "cpu", "cuda"]
+Share = Annotated[float, Meta(ge=0, le=1)]
 Width = Annotated[int, Meta(ge=1, le=8192)]
 
 
@@ -133,8 +134,11 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     alpha_floor: Annotated[float, Meta(ge=0, description="The temperature does not fall below this.")] = 0.005
     alpha_floor_end: Annotated[
         Annotated[float, Meta(ge=0)] | None,
-        Meta(description="Value that the floor falls to over the second half of training; null: it stays."),
+        Meta(description="Value that the floor falls to during `alpha_fall`; null: it stays."),
     ] = None
+    alpha_fall: Annotated[
+        tuple[Share, Share], Meta(description="Shares of training between which the floor falls.")
+    ] = (0.5, 1.0)
     init_alpha: Annotated[float, Meta(gt=0, description="Temperature at the start.")] = 0.05
     target_entropy: Annotated[
         float | None, Meta(description="Entropy the temperature aims at [nat]; null: -actions.")
@@ -320,6 +324,8 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
             f"{source}: skill.learning_starts = {skill.learning_starts}, "
             f"expected < skill.total_steps = {skill.total_steps}"
         )
+    if skill.alpha_fall[0] >= skill.alpha_fall[1]:
+        raise ConfigError(f"{source}: skill.alpha_fall = {list(skill.alpha_fall)}, expected an earlier share first")
     if skill.overlap and skill.collector == "local":
         raise ConfigError(f"{source}: skill.overlap = true, expected with skill.collector = 'multi' or 'ray' only")
     if skill.preset == "baseline" and (reward.path_distance or reward.progress):

@@ -90,11 +90,12 @@ def make_learner(config: TrainConfig) -> Learner:
 
 
 def alpha_floor(skill: SkillConfig, steps: int) -> float:
-    """Floor of the temperature after so many steps: falls geometrically over the second half of training."""
+    """Floor of the temperature after so many steps: falls geometrically during `alpha_fall`."""
     first, last = skill.alpha_floor, skill.alpha_floor_end
     if last is None or first == 0.0:
         return first
-    share = min(max(2.0 * steps / skill.total_steps - 1.0, 0.0), 1.0)
+    begin, end = skill.alpha_fall
+    share = min(max((steps / skill.total_steps - begin) / (end - begin), 0.0), 1.0)
     return first * (max(last, 1e-6) / first) ** share
 
 
