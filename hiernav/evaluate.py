@@ -200,11 +200,14 @@ def _from_bundle(path: Path) -> Policies:
 
 
 def _from_run(path: Path) -> Policies:
+    import torch
+
     from hiernav.planner.network import TorchNetwork
     from hiernav.planner.train import load_network
     from hiernav.run import Run, RunError
     from hiernav.skill.train import TorchSkill, load_actor
 
+    torch.set_num_threads(1)  # for products this small, threads mostly wait for each other
     run = Run.open(path)
     skill, planner = run.load("skill"), run.load("planner")
     if skill is None:

@@ -335,3 +335,8 @@ def test_a_folder_of_any_name_survives_writing_and_reading(tmp_path: Path, name:
     config = msgspec.structs.replace(load_config(), run_dir=name)
     file.write_text(dump_config(config), encoding="utf-8")
     assert load_config(file) == config
+
+
+def test_the_floor_of_the_temperature_falls_forwards() -> None:
+    with pytest.raises(ConfigError, match=r"skill.alpha_fall = \[0.8, 0.4\], expected an earlier share first"):
+        load_config(None, ["skill.alpha_fall=[0.8, 0.4]"])
