@@ -143,6 +143,8 @@ def measure(
         trips = robot.watchdog_trips
         robot.close()
         link.close()
+    if "ticks_to_brake" not in facts:
+        raise SystemExit("bench_loop: the run was interrupted")
     loop, timer = driver.loop, driver.timer
     return {
         "rate": rate,
