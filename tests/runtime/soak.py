@@ -69,7 +69,7 @@ class Spoiler:
     """A planner that can be made to say nonsense."""
 
     def __init__(self) -> None:
-        self.planner = VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(), 0.1)
+        self.planner = VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(cache_size=4), 0.1)
         self.fault = "none"
 
     def plan(self, query: PlanQuery) -> np.ndarray:
