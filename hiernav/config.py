@@ -328,6 +328,10 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
         raise ConfigError(f"{source}: skill.alpha_fall = {list(skill.alpha_fall)}, expected an earlier share first")
     if skill.overlap and skill.collector == "local":
         raise ConfigError(f"{source}: skill.overlap = true, expected with skill.collector = 'multi' or 'ray' only")
+    if skill.preset == "baseline" and skill.planner == "cnn":
+        raise ConfigError(
+            f"{source}: skill.planner = 'cnn', expected 'astar': skill.preset = 'baseline' follows no plan"
+        )
     if skill.preset == "baseline" and (reward.path_distance or reward.progress):
         raise ConfigError(
             f"{source}: reward.path_distance = {reward.path_distance} and reward.progress = {reward.progress}, "

@@ -340,3 +340,8 @@ def test_a_folder_of_any_name_survives_writing_and_reading(tmp_path: Path, name:
 def test_the_floor_of_the_temperature_falls_forwards() -> None:
     with pytest.raises(ConfigError, match=r"skill.alpha_fall = \[0.8, 0.4\], expected an earlier share first"):
         load_config(None, ["skill.alpha_fall=[0.8, 0.4]"])
+
+
+def test_a_baseline_has_no_planner_network_to_follow() -> None:
+    with pytest.raises(ConfigError, match="skill.planner = 'cnn', expected 'astar'"):
+        load_config(None, ["skill.preset=baseline", "skill.planner=cnn"])
