@@ -94,17 +94,16 @@ def images(
         if source not in _SOURCES or crop not in _SIDES:
             raise ValueError(f"GOSELO channel {name!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
     out = np.empty((len(frame.position), len(channels), PIXELS, PIXELS), dtype=np.uint8)
-    right = frame.right
-    for row in range(len(out)):
+    # plain floats: arrays of two numbers would take longer than the crops
+    rows = zip(frame.position.tolist(), frame.up.tolist(), frame.distance.tolist(), strict=True)
+    for row, ((x, y), up, length) in enumerate(rows):
         levels = {s: _pyramid(s, occupancy[row], visits[row]) for s in dict.fromkeys(source for source, _ in plan)}
-        length, up, here = float(frame.distance[row]), frame.up[row], frame.position[row]
+        middle = (x + 0.5 * length * up[0], y + 0.5 * length * up[1])
         for channel, (source, crop) in enumerate(plan):
-            center = here if crop == "local" else here + 0.5 * length * up
             out[row, channel] = _crop(
                 levels[source],
                 occupancy[row],
-                center,
-                right[row],
+                (x, y) if crop == "local" else middle,
                 up,
                 _SIDES[crop](length),
                 outside=255 if source == "obstacles" else 0,
@@ -152,9 +151,8 @@ def _halve(level: np.ndarray, outside: int) -> list[np.ndarray]:
 def _crop(
     levels: list[np.ndarray],
     occupancy: OccupancyMap,
-    center: np.ndarray,
-    right: np.ndarray,
-    up: np.ndarray,
+    center: Sequence[float],
+    up: Sequence[float],
     side: float,
     outside: int,
 ) -> np.ndarray:
@@ -164,12 +162,14 @@ def _crop(
     step = occupancy.resolution * 2**depth
     samples = max(1, math.ceil(pixel / step - 1e-6))  # per pixel and axis, so that none of the level is skipped
     count, fine = PIXELS * samples, pixel / samples
-    across, down = right * fine / step, -up * fine / step
-    corner = center + (-side / 2 + fine / 2) * right + (side / 2 - fine / 2) * up
-    offset = (corner - np.asarray(occupancy.origin)) / step - 0.5
+    (ux, uy), half = up, 0.5 * (side - fine)
+    # right is (uy, -ux); the first sample is the upper left one
+    x = (center[0] + half * (ux - uy) - occupancy.origin[0]) / step - 0.5
+    y = (center[1] + half * (uy + ux) - occupancy.origin[1]) / step - 0.5
+    scale = fine / step
     image = cv2.warpAffine(
         levels[depth],
-        np.array([[across[0], down[0], offset[0]], [across[1], down[1], offset[1]]]),
+        np.array([[uy * scale, -ux * scale, x], [-ux * scale, -uy * scale, y]]),
         (count, count),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,

@@ -6,6 +6,7 @@ world axes. A pixel's centre is at origin + (index + 0.5) * resolution.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -156,10 +157,11 @@ class VisitMap:
     def near(self, position: ArrayLike, radius: float) -> bool:
         """Whether the robot has been in a pixel that meets the square of half-side `radius` [m] around a position."""
         x, y = np.asarray(position, dtype=np.float64).tolist()
-        first = np.floor((np.array([y, x]) - radius - self.origin[::-1]) / self.resolution).astype(int)
-        last = np.floor((np.array([y, x]) + radius - self.origin[::-1]) / self.resolution).astype(int)
-        (top, left), (bottom, right) = np.maximum(first, 0).tolist(), (last + 1).tolist()
-        return bool(self.counts[top : max(bottom, 0), left : max(right, 0)].any())
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return False
+        left, right = (math.floor((x + d - self.origin[0]) / self.resolution) for d in (-radius, radius))
+        bottom, top = (math.floor((y + d - self.origin[1]) / self.resolution) for d in (-radius, radius))
+        return bool(self.counts[max(bottom, 0) : max(top + 1, 0), max(left, 0) : max(right + 1, 0)].any())
 
     def _pixel(self, x: float, y: float) -> tuple[int, int] | None:
         xmin, xmax, ymin, ymax = self._extent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,13 +12,14 @@ import numpy as np
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
-from hiernav.nav.path import divide, polyline
+from hiernav.nav.path import polyline
 from hiernav.nav.search import PathField
 
 Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
 scores (M, H) of H hypotheses."""
 
+_FARTHEST = 100.0
 _TIGHTNESS = 4.0
 """Score that a hypothesis loses which leaves nothing beyond the radius."""
 
@@ -211,18 +213,26 @@ def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMa
 
     Args:
         start: (M, 2) [m].
-        plans: (M, K, 2) [m]; NaN gives NaN.
+        plans: (M, K, 2) [m]; NaN, and what is farther than 100 m from the start in x or y, gives NaN.
 
     Returns:
         (M,) [m].
     """
-    finite = np.isfinite(plans).all(axis=(1, 2))
+    finite = (np.abs(plans - start[:, None]) <= _FARTHEST).all(axis=(1, 2))
     line = polyline(start, np.where(finite[:, None, None], plans, start[:, None]))
-    clearance = occupancy.clearance_at(divide(line, spacing))
-    escape = clearance[:, :1]
-    leaving = np.arange(clearance.shape[1]) * spacing < 0.15
-    excused = leaving & (np.diff(clearance, axis=1, prepend=escape) >= -1e-6) & (clearance >= escape - 1e-6)
-    return np.where(finite, np.where(excused, np.inf, clearance).min(axis=1, initial=np.inf), np.nan)
+    steps = np.diff(line, axis=1)
+    lengths = np.sqrt((steps * steps).sum(axis=-1))
+    # as many pieces of every step as the longest one needs
+    pieces = max(1, math.ceil(lengths.max(initial=0.0) / spacing - 1e-6))
+    t = np.arange(pieces) / pieces
+    points = line[:, :-1, None] + t[:, None] * steps[:, :, None]
+    points = np.concatenate([points.reshape(len(line), -1, 2), line[:, -1:]], axis=1)
+    arc = np.cumsum(np.repeat(lengths / pieces, pieces, axis=1), axis=1)
+    clearance = occupancy.clearance_at(points)
+    ahead, escape = clearance[:, 1:], clearance[:, :1]
+    excused = (arc < 0.15 - 1e-9) & (ahead >= clearance[:, :-1] - 1e-6) & (ahead >= escape - 1e-6)
+    # the start itself is where the robot is, whatever the plan
+    return np.where(finite, np.where(excused, np.inf, ahead).min(axis=1, initial=np.inf), np.nan)
 
 
 def verified_planner(
