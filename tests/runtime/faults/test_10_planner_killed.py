@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 from puck import LAYOUT, Listener, Puck, follow
+from punctual import punctual
 from shipped import open_shipped
 from test_09_planner_hangs import ask
 
@@ -70,7 +71,8 @@ def test_the_loop_misses_no_extra_tick():
     driver._step = step
     try:
         ask(planner)
-        result = driver.run(np.array([1.9, 1.9]), max_steps=400)
+        with punctual():
+            result = driver.run(np.array([1.9, 1.9]), max_steps=400)
     finally:
         planner.close()
     assert result.reached and len(set(killed)) == 2 and planner.restart_count() == 2

@@ -7,6 +7,7 @@ import multiprocessing
 import numpy as np
 import pytest
 from puck import GOAL, Listener, Puck, Scripted, driver_of
+from punctual import punctual
 
 from hiernav.runtime.clock import FakeClock, MonotonicClock
 from hiernav.runtime.supervisor import Mode
@@ -59,7 +60,8 @@ def test_two_hogs_cost_at_most_2_percent_of_the_ticks():
     for hog in hogs:
         hog.start()
     try:
-        driver.run(np.array([1.95, 1.95]), max_steps=10**6)
+        with punctual():
+            driver.run(np.array([1.95, 1.95]), max_steps=10**6)
     finally:
         for hog in hogs:
             hog.kill()
