@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from hiernav.nav.occupancy import MAX_SIDE, RESOLUTION, OccupancyMap, check_geometry
 
 MAX_YAML_BYTES = 65536
+MAX_PIXELS = 2**26
+"""Of a picture: 410 m by 410 m at 0.05 m. A small file can stand for many more, and decoding takes gigabytes."""
 _MAX_PIXEL_BYTES = 16  # an ASCII PGM value with generous white space
 _HEADER_BYTES = 4096
 _PGM_HEADER = re.compile(rb"(P[25])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"\s")
@@ -36,8 +38,8 @@ def load_map(path: str | Path) -> OccupancyMap:
     A map of another resolution is resampled conservatively: a cell is occupied if any part of it is.
 
     Raises MapFileError, before the picture is decoded where its header allows, for a missing or malformed file, a
-    side of 0 or more than 16384 pixels, a resolution that is not finite and positive, a rotated origin, and a picture
-    outside the YAML file's folder.
+    side of 0 or more than 16384 pixels or 2^26 in all, a resolution that is not finite and positive, a rotated origin,
+    and a picture outside the YAML file's folder.
     """
     path = Path(path)
     entries = _read_entries(path)
@@ -65,6 +67,8 @@ def load_map(path: str | Path) -> OccupancyMap:
                 raise MapFileError(
                     f"{image_path}: {width} x {height} pixels, each side must be between 1 and {MAX_SIDE}"
                 )
+        if width * height > MAX_PIXELS:
+            raise MapFileError(f"{image_path}: {width} x {height} pixels, at most {MAX_PIXELS:,} are accepted")
         cells = tuple(max(1, math.ceil(side * resolution / RESOLUTION - 1e-6)) for side in (height, width))
         try:
             check_geometry(cells, RESOLUTION, origin)
@@ -169,13 +173,14 @@ def _read_png(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape[:2] != shape:
         raise MapFileError(f"{path}: damaged PNG picture, {shape[1]} x {shape[0]} pixels cannot be decoded")
-    image = image.astype(np.float32) / (65535.0 if image.dtype == np.uint16 else 255.0)
+    top = 65535 if image.dtype == np.uint16 else 255
     if image.ndim == 2:
-        return image
-    color = image[..., :3].mean(axis=2) if image.shape[2] >= 3 else image[..., 0]
+        return image.astype(np.float32) / np.float32(top)
+    shown = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
+    color = shown.mean(axis=2, dtype=np.float32) / np.float32(top)
     if image.shape[2] == 4:
         # NaN is never below or above a threshold: a transparent pixel stays unknown
-        color[image[..., 3] < 1.0] = np.nan
+        color[image[..., 3] < top] = np.nan
     return color
 
 

@@ -103,8 +103,37 @@ def test_the_page_loads_the_robot_moves_and_a_click_sets_the_goal(robot, browser
     until(lambda: math.dist(numbers("position"), aim) < 0.8, "the robot does not go where was clicked")
     assert math.dist(began, numbers("position")) > 0.3
     events = browser.execute_script("return document.body.innerText")
-    goals = [tuple(map(float, pair)) for pair in re.findall(r"goal (-?[\d.]+), (-?[\d.]+)", events)]
+    goals = [tuple(map(float, pair)) for pair in re.findall(r"goal (-?[\d.e-]+), (-?[\d.e-]+)", events)]
     assert any(math.dist(goal, aim) < 0.3 for goal in goals), events
+
+
+@needs_viser
+@pytest.mark.realtime
+def test_the_loop_is_as_punctual_with_the_page_open_or_stalled_as_without(browser, tmp_path):
+    def lateness(condition: str) -> float:
+        """99th percentile over some seconds [s]."""
+        out = tmp_path / condition
+        flags = ["--serve"] if condition == "closed" else ["--view", "0"]
+        flags += ["--control", str(tmp_path / f"{condition}.sock")]
+        process = subprocess.Popen(
+            [sys.executable, str(SCRIPT), *flags, "--world", "pillar(2,2,0)", "--no-pictures", "--out", str(out)],
+            stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(SCRIPT.parents[1])},
+        )  # fmt: skip
+        line = process.stdout.readline()
+        if condition == "open":
+            browser.get(line.split()[-1])
+        elif condition == "stalled":
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            pages = [pid for pid in children if b"hiernav.view" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+            os.kill(int(pages[0]), signal.SIGSTOP)
+        time.sleep(10.0)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WAIT) == 0
+        return json.loads((out / "summary.json").read_text())["timing"]["lateness"]["p99"]
+
+    found = {condition: lateness(condition) for condition in ("closed", "open", "stalled")}
+    print({name: f"{1e3 * value:.3f} ms" for name, value in found.items()})
+    assert max(found["open"], found["stalled"]) < found["closed"] + 1e-3, found
 
 
 @needs_viser

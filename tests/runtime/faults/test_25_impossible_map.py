@@ -42,6 +42,7 @@ CASES = [
     ("40 x 0 pixels", lambda d: write(d, png(40, 0), "map.png"), "40 x 0 pixels"),
     ("65536 x 65536 PGM", lambda d: write(d, pgm(65536, 65536)), "65536 x 65536 pixels"),
     ("65536 x 65536 PNG", lambda d: write(d, png(65536, 65536), "map.png"), "65536 x 65536 pixels"),
+    ("10000 x 10000 PNG", lambda d: write(d, png(10000, 10000), "map.png"), "at most 67,108,864"),
     ("resolution 0", lambda d: write(d, pgm(2, 2, b"\xff" * 4), resolution=0), "resolution 0"),
     ("resolution NaN", lambda d: write(d, pgm(2, 2, b"\xff" * 4), resolution=".nan"), "resolution nan"),
     ("resolution inf", lambda d: write(d, pgm(2, 2, b"\xff" * 4), resolution=".inf"), "resolution inf"),
