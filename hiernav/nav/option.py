@@ -407,6 +407,7 @@ class HierarchicalAgent:
         """
         step = self.option.step(pose[:, :2], goal, occupancy)
         plan = self.recovery(pose, step.plan, occupancy)
+        self.option.waiting |= self.recovery.ended
         observation = self.layout.build(guided(terms, pose, plan, goal, self._steps * self.control_period))
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)

@@ -12,7 +12,7 @@ import numpy as np
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
-from hiernav.nav.path import polyline
+from hiernav.nav.path import arc_lengths, polyline
 from hiernav.nav.search import PathField
 
 Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -130,10 +130,10 @@ class GoseloPlanner:
 class VerifiedPlanner:
     """Checks every proposal and replaces the bad ones by the shortest path.
 
-    A proposal is bad if its sweep meets the map, or if its second half leads where the robot has been: a network
-    without memory can lead to and fro between two ways, a shortest path never does. Counts proposals, repairs, loops
-    (the repairs of the second kind) and refusals (no path exists either: the row is NaN then, or the proposal that
-    leads back if it is free).
+    A proposal is bad if its sweep meets the map, if its second half leads where the robot has been, or if it does not
+    bring the robot nearer to the goal along the shortest path: a network without memory can lead to and fro between two
+    ways, a shortest path never does. Counts proposals, repairs, loops and detours among them (of the second and third
+    kind) and refusals (no path exists either: the row is NaN then, or the proposal if it is free).
     """
 
     planner: Planner
@@ -141,8 +141,11 @@ class VerifiedPlanner:
     radius: float = 0.1
     """Disc that must fit along the plan [m]."""
     proposals: int = 0
+    least_gain: float = 0.5
+    """Share of its length by which a plan must shorten the way to the goal."""
     repairs: int = 0
     loops: int = 0
+    detours: int = 0
     refusals: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
     """Refusals by why there is no path (`hiernav.nav.search.REFUSALS`)."""
@@ -158,7 +161,8 @@ class VerifiedPlanner:
         )
         free = clearance >= self.radius
         back = np.array([ok and self._leads_back(*row) for ok, *row in zip(free, plans, query.visits, strict=True)])
-        bad = np.flatnonzero(~free | back).tolist()
+        away = np.array([ok and self._leads_away(query, plans[row], row) for row, ok in enumerate(free & ~back)])
+        bad = np.flatnonzero(~free | back | away).tolist()
         if not bad:
             return plans
         part = PlanQuery(
@@ -175,14 +179,22 @@ class VerifiedPlanner:
         plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
         self.repairs += int(found.sum())
         self.loops += int((found & back[bad]).sum())
+        self.detours += int((found & away[bad]).sum())
         self.refusals += len(refused)
         self.reasons.update(self.repair.refusal(part, row) or "unknown" for row in refused)
         return plans
 
     def counts(self) -> dict[str, int]:
-        """Proposals, repairs, loops among them, refusals and why, `refusals/...`, since the start."""
-        totals = {name: getattr(self, name) for name in ("proposals", "repairs", "loops", "refusals")}
+        """Proposals, repairs, loops and detours among them, refusals and why, `refusals/...`, since the start."""
+        totals = {name: getattr(self, name) for name in ("proposals", "repairs", "loops", "detours", "refusals")}
         return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
+
+    def _leads_away(self, query: PlanQuery, plan: np.ndarray, row: int) -> bool:
+        field = self.repair.field(query.occupancy[row], query.goal[row])
+        here, there = field.distance_at(np.stack([query.position[row], plan[-1]]))
+        length = arc_lengths(polyline(query.position[row][None], plan[None]))[0, -1]
+        # from where there is no path, inf - inf says nothing against the plan
+        return bool(here - there < self.least_gain * length)
 
     def _leads_back(self, plan: np.ndarray, visits: VisitMap) -> bool:
         return any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])

@@ -27,6 +27,7 @@ class Recovery:
     Attributes:
         counts: (N,) int, recoveries since the reset.
         active: (N,) bool, whether the robot is on its way out.
+        ended: (N,) bool, whether it was until this step: time for another plan.
         given_up: (N,) bool.
     """
 
@@ -55,6 +56,7 @@ class Recovery:
         self.counts = np.zeros(num_rows, dtype=np.int64)
         self._asked = np.zeros(num_rows, dtype=bool)
         self.active = np.zeros(num_rows, dtype=bool)
+        self.ended = np.zeros(num_rows, dtype=bool)
         self.given_up = np.zeros(num_rows, dtype=bool)
 
     def reset(self, rows: np.ndarray | slice | None = None) -> None:
@@ -62,7 +64,7 @@ class Recovery:
         rows = slice(None) if rows is None else rows
         self._trail[rows], self._place[rows] = np.nan, np.nan
         self._tick[rows] = self._left[rows] = self._tries[rows] = self.counts[rows] = 0
-        self._asked[rows] = self.active[rows] = self.given_up[rows] = False
+        self._asked[rows] = self.active[rows] = self.ended[rows] = self.given_up[rows] = False
 
     def rest(self) -> None:
         """The robots were made to wait: forget that they have not moved, not how often they had to be helped."""
@@ -101,7 +103,9 @@ class Recovery:
         for k in np.flatnonzero(stuck & ~self.given_up[rows]).tolist():
             self._begin(int(rows[k]), pose[k], plan[k], occupancy[k])
         self._left[rows[np.linalg.norm(position - self._began[rows], axis=-1) > self.reach_m]] = 0
-        self.active[rows] = active = self._left[rows] > 0
+        active = self._left[rows] > 0
+        self.ended[:] = False
+        self.ended[rows], self.active[rows] = self.active[rows] & ~active, active
         self._left[rows] -= active
         if not active.any():
             return plan

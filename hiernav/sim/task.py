@@ -178,7 +178,10 @@ class NavigationTask:
         pick = slice(None) if rows is None else rows  # of all rows no copy is made
         pose, goal = self.sim.pose[pick], self.goal[pick]
         option = self.option.step(pose[:, :2], goal, maps, rows)
-        plan = option.plan if self.recovery is None else self.recovery(pose, option.plan, maps, rows)
+        plan = option.plan
+        if self.recovery is not None:
+            plan = self.recovery(pose, plan, maps, rows)
+            self.option.waiting |= self.recovery.ended
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
         values = guided(sensors, pose, plan, goal, self.steps[pick] * self.robot.control_period)
         values["lidar"] = lidar_closeness(pose, self._points[pick])

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
+from hiernav.nav.option import HierarchicalAgent, PlanQuery, WaypointOption
 from hiernav.nav.recovery import Recovery, way_out
 
 PERIOD = 0.1
@@ -14,6 +16,7 @@ WINDOW, DURATION = 15, 10
 AHEAD = 0.1 * np.arange(1, 11)[None, :, None] * [1.0, 0.0]
 FAR = AHEAD + [9.0, 0.0]
 FREE = empty_map((3.0, 3.0))
+SENSORS = {"accelerometer": 3, "velocimeter": 3, "gyro": 3, "magnetometer": 3, "lidar": 10}
 
 
 def drive(recovery: Recovery, positions: np.ndarray, plan: np.ndarray = AHEAD) -> list[bool]:
@@ -90,6 +93,28 @@ def test_some_rows_may_be_asked_about_alone() -> None:
         followed = recovery(np.zeros((1, 3)), AHEAD, [FREE], np.array([1]))
     assert recovery.active.tolist() == [False, True, False]
     assert followed is not AHEAD
+
+
+def test_the_end_of_a_recovery_is_told_once_and_asks_for_another_plan() -> None:
+    recovery, told = Recovery(1, PERIOD), []
+    for _ in range(WINDOW + DURATION + 3):
+        recovery(np.zeros((1, 3)), AHEAD, [FREE])
+        told.append(bool(recovery.ended[0]))
+    assert [t for t, ended in enumerate(told) if ended] == [WINDOW + DURATION]
+    asked: list[int] = []
+
+    class Asked:
+        def plan(self, query: PlanQuery) -> np.ndarray:
+            asked.append(step)
+            return query.position[:, None] + AHEAD
+
+    agent = HierarchicalAgent(
+        WaypointOption(Asked(), 1), lambda o: np.zeros((1, 2)), observation_layout("point"), PERIOD
+    )
+    sensors = {name: np.zeros((1, size)) for name, size in SENSORS.items()}
+    for step in range(WINDOW + DURATION + 3):
+        agent.act(np.zeros((1, 3)), sensors, np.array([[2.0, 0.0]]), [FREE])
+    assert asked == [0, WINDOW + DURATION + 1]
 
 
 # the way out
