@@ -552,7 +552,8 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
     for name, row in results.items():
         replans = ", ".join(f"{reason} {count}" for reason, count in row["replans"].items())
         checked = (
-            f"; {row['repairs']} of {row['proposals']} plans repaired, {row['loops']} for leading back"
+            f"; {row['repairs']} of {row['proposals']} plans repaired, "
+            f"{row['loops']} for leading back, {row['detours']} for leading away"
             if "repairs" in row
             else ""
         )

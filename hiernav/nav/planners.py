@@ -13,7 +13,7 @@ from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import arc_lengths, polyline
-from hiernav.nav.search import PathField
+from hiernav.nav.search import CELL, PathField
 
 Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
@@ -141,6 +141,8 @@ class VerifiedPlanner:
     radius: float = 0.1
     """Disc that must fit along the plan [m]."""
     proposals: int = 0
+    goal_radius: float = 0.3
+    """Plans are judged up to where they come this close to the goal [m]."""
     least_gain: float = 0.5
     """Share of its length by which a plan must shorten the way to the goal."""
     repairs: int = 0
@@ -190,11 +192,14 @@ class VerifiedPlanner:
         return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
 
     def _leads_away(self, query: PlanQuery, plan: np.ndarray, row: int) -> bool:
+        # behind the goal every way leads away from it
+        reached = np.flatnonzero(np.linalg.norm(plan - query.goal[row], axis=-1) <= self.goal_radius)
+        driven = plan[: reached[0] + 1] if len(reached) else plan
         field = self.repair.field(query.occupancy[row], query.goal[row])
-        here, there = field.distance_at(np.stack([query.position[row], plan[-1]]))
-        length = arc_lengths(polyline(query.position[row][None], plan[None]))[0, -1]
-        # from where there is no path, inf - inf says nothing against the plan
-        return bool(here - there < self.least_gain * length)
+        here, there = field.distance_at(np.stack([query.position[row], driven[-1]]))
+        length = arc_lengths(polyline(query.position[row][None], driven[None]))[0, -1]
+        # less a cell, which is how exactly the way is known; where there is none, inf - inf speaks for no plan
+        return bool(here - there < self.least_gain * length - CELL)
 
     def _leads_back(self, plan: np.ndarray, visits: VisitMap) -> bool:
         return any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])

@@ -271,7 +271,7 @@ class SkillTrainer:
         if not isinstance(self.planner, VerifiedPlanner):
             return {}
         before, self._plans = self._plans, self.planner.counts()
-        names = ("proposals", "repairs", "loops", "refusals")
+        names = ("proposals", "repairs", "loops", "detours", "refusals")
         return {f"plans/{name}": float(self._plans[name] - before.get(name, 0)) for name in names}
 
     def _next_evaluation(self) -> float:

@@ -274,13 +274,37 @@ def test_each_robot_of_a_batch_chooses_for_itself() -> None:
 def test_a_plan_that_leads_where_the_robot_has_been_is_replaced_by_the_shortest_path() -> None:
     planner, proposer = verified()
     query = query_of([(0.0, 0.0), (0.0, 0.0)], [(1.5, 0.0), (1.5, 0.0)], FREE)
-    away = np.stack([straight((0.0, 0.0), np.pi), straight((0.0, 0.0), np.pi)])
-    proposer.plan = lambda query: away.copy()
-    query.visits[1].add(straight((0.0, 0.0), np.pi)[:6])
+    aside = np.stack([straight((0.0, 0.0), np.pi / 5), straight((0.0, 0.0), np.pi / 5)])
+    proposer.plan = lambda query: aside.copy()
+    query.visits[1].add(aside[1, :6])
     plans = planner.plan(query)
-    assert_array_equal(plans[0], away[0])
+    assert_array_equal(plans[0], aside[0])
     assert_array_equal(plans[1], planner.repair.plan(query)[1])
     assert (*counts(planner), planner.loops) == (2, 1, 0, 1)
+
+
+def test_a_plan_that_does_not_bring_the_robot_nearer_to_the_goal_is_replaced() -> None:
+    planner, proposer = verified()
+    query = query_of([(0.0, 0.0)] * 2, [(1.5, 0.0)] * 2, FREE)
+    proposed = np.stack([straight((0.0, 0.0), np.pi / 2), straight((0.0, 0.0), np.pi / 5)])
+    proposer.plan = lambda query: proposed.copy()
+    plans = planner.plan(query)
+    assert_array_equal(plans[0], planner.repair.plan(query)[0])
+    assert_array_equal(plans[1], proposed[1])
+    assert (*counts(planner), planner.loops, planner.detours) == (2, 1, 0, 0, 1)
+
+
+def test_nearer_means_on_the_way_around_obstacles() -> None:
+    """Behind a wall, the way to the goal leads away from it first."""
+    planner, proposer = verified()
+    walled = map_with_pillars()
+    walled.occupied[:80, 70:72] = True  # up to y = 1, at x = 0.5
+    query = query_of([(0.0, 0.0)], [(1.5, 0.0)], walled)
+    shortest = planner.repair.plan(query)
+    assert shortest[0, -1, 1] > 0.5
+    proposer.plan = lambda query: shortest.copy()
+    assert_array_equal(planner.plan(query), shortest)
+    assert planner.detours == 0
 
 
 def test_a_free_plan_that_leads_back_stands_where_there_is_no_path() -> None:

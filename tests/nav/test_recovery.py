@@ -102,18 +102,19 @@ def test_the_end_of_a_recovery_is_told_once_and_asks_for_another_plan() -> None:
         told.append(bool(recovery.ended[0]))
     assert [t for t, ended in enumerate(told) if ended] == [WINDOW + DURATION]
     asked: list[int] = []
+    actions: list[np.ndarray] = []
 
     class Asked:
         def plan(self, query: PlanQuery) -> np.ndarray:
-            asked.append(step)
+            asked.append(len(actions))
             return query.position[:, None] + AHEAD
 
     agent = HierarchicalAgent(
         WaypointOption(Asked(), 1), lambda o: np.zeros((1, 2)), observation_layout("point"), PERIOD
     )
     sensors = {name: np.zeros((1, size)) for name, size in SENSORS.items()}
-    for step in range(WINDOW + DURATION + 3):
-        agent.act(np.zeros((1, 3)), sensors, np.array([[2.0, 0.0]]), [FREE])
+    for _ in range(WINDOW + DURATION + 3):
+        actions.append(agent.act(np.zeros((1, 3)), sensors, np.array([[2.0, 0.0]]), [FREE]).action)
     assert asked == [0, WINDOW + DURATION + 1]
 
 

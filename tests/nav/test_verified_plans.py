@@ -136,14 +136,14 @@ def test_a_much_better_score_is_a_cause_to_change_sides() -> None:
 
 
 def test_the_shipped_network_keeps_to_its_side_of_obstacles(network: GoseloPlanner) -> None:
-    """A robot that stands, with a pose that is 2 cm wrong, before the worlds' obstacles: plans end where they did."""
+    """A robot that stands, with a pose that is 5 cm wrong, before the worlds' obstacles: plans end where they did."""
     changed = {True: 0, False: 0}
-    for layout in layouts_of("pillar(3,3,25)", 30, 0.1):
+    for layout in layouts_of("pillar(3,3,25)", 60, 0.1):
         occupancy, goal = layout.occupancy(0.0), layout.goal[None]
         for remember in changed:
             rng, previous = np.random.default_rng(2), np.full((1, 10, 2), np.nan)
             for _ in range(8):
-                where = layout.start[None, :2] + rng.normal(0.0, 0.02, (1, 2))
+                where = layout.start[None, :2] + rng.normal(0.0, 0.05, (1, 2))
                 shown = previous if remember else np.full((1, 10, 2), np.nan)
                 plan = network.plan(PlanQuery(where, goal, [occupancy], [VisitMap(occupancy)], shown))
                 changed[remember] += int(np.linalg.norm(plan[0, -1] - previous[0, -1]) > 0.3)
