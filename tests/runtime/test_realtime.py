@@ -23,7 +23,10 @@ def test_every_setting_is_reported_as_granted_or_with_the_reason_why_not():
 
 
 def test_what_is_not_asked_for_is_left_alone():
-    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(0, None, False, None, False))")
+    report = in_a_process_of_its_own(
+        "nothing = RealtimeConfig(timer_slack_ns=0, fifo_priority=None, lock_memory=False, freeze_gc=False)\n"
+        "report = request_realtime(nothing)"
+    )
     assert report == dict.fromkeys(SETTINGS, "not asked")
 
 

@@ -27,7 +27,7 @@ def test_a_bundle_with_a_damaged_file_ends_with_exit_code_3_before_anything_move
         data[len(data) // 2] ^= 0x80
         (folder / name).write_bytes(data)
     script = load_script()
-    monkeypatch.setattr(script, "SimRobot", lambda *_args, **_settings: pytest.fail("a robot was opened"))
+    monkeypatch.setattr("hiernav.runtime.sim_robot.SimRobot", lambda *_args, **_: pytest.fail("a robot was opened"))
     arguments = ["--fast", "--no-pictures", "--bundle", str(folder), "--out", str(tmp_path / "out")]
     assert script.main(arguments) == 3
     assert name in capsys.readouterr().err

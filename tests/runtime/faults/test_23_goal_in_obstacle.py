@@ -14,7 +14,7 @@ from hiernav.runtime.driver import DriverConfig
 def drive(occupancy, goal, tolerance=0.3):
     robot = Puck(control_period=0.02, noise=1e-3)
     pilot = pilot_for(ShortestPathPlanner(), period=0.02)
-    config = DriverConfig(goal_tolerance=tolerance, goal_radius=0.1)
+    config = DriverConfig(goal_tolerance=tolerance, goal_radius=0.2)
     driver = driver_of(robot, pilot, occupancy=lambda stamp: occupancy, config=config)
     return robot, driver, driver.run(np.array(goal))
 
@@ -24,7 +24,7 @@ def test_a_goal_in_the_edge_of_an_obstacle_is_moved_to_the_nearest_free_point():
     placed = place_goal(occupancy, np.zeros(2), np.array([0.85, 0.0]), 0.3)
     assert not occupancy.occupied_at(placed) and np.linalg.norm(placed - [0.85, 0.0]) <= 0.1
     robot, driver, result = drive(occupancy, [0.85, 0.0])
-    assert result.reached and np.linalg.norm(robot.position - placed) < 0.2
+    assert result.reached and np.linalg.norm(robot.position - placed) < 0.25
 
 
 def test_a_goal_deep_inside_is_refused_by_code_and_nothing_moves():
