@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -368,7 +369,9 @@ def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, ca
 
 def start(*arguments: str) -> subprocess.Popen[str]:
     command: Sequence[str] = (sys.executable, "-m", "hiernav.cli", *arguments)
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # where the tests run in the background of a shell, Ctrl-C is ignored by all that they start
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
 
 
 def await_file(file: Path, process: subprocess.Popen[str], timeout: float = 120.0) -> None:
