@@ -196,6 +196,9 @@ class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     collision: Annotated[float, Meta(description="Per control step with any contact with an obstacle.")] = -1.0
     goal: Annotated[float, Meta(description="Once, on reaching the goal.")] = 1.0
     leave_field: Annotated[float, Meta(description="Once, on leaving the field.")] = -3.0
+    tilt: Annotated[
+        float, Meta(description="Per unit that the vertical part of the body's axis falls short of 0.8.")
+    ] = -3.0
     fall: Annotated[float, Meta(description="Per control step on its back; see skill.end_on_fall.")] = -3.0
     goal_distance: Annotated[float, Meta(description="Per metre of distance to the goal, every step.")] = 0.0
     lookahead_m: Annotated[
@@ -255,7 +258,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "option": {"paper": {"invalid": False}},
     "reward": {
-        "paper": {"leave_field": 0.0, "fall": 0.0},
+        "paper": {"leave_field": 0.0, "tilt": 0.0, "fall": 0.0},
         # every step costs the distance to the goal, so that an early end has to cost more than all steps it spares
         "baseline": {
             "leave_field": -60.0,

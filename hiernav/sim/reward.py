@@ -10,7 +10,10 @@ import numpy as np
 from hiernav.config import RewardConfig
 from hiernav.nav import path
 
-TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "fall", "goal_distance")
+TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "tilt", "fall", "goal_distance")
+
+_LEVEL = 0.8
+"""Uprightness below which a body counts as tilted: 37 degrees, more than a sound gait sways."""
 
 
 def weighted_sum(config: RewardConfig, terms: dict[str, np.ndarray]) -> np.ndarray:
@@ -27,7 +30,7 @@ def reward_terms(
     collided: np.ndarray,
     reached: np.ndarray,
     left: np.ndarray,
-    fallen: np.ndarray,
+    upright: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Unweighted terms of one control step, each (N,) float64.
 
@@ -35,7 +38,8 @@ def reward_terms(
         before, after: (N, 2) position at both ends of the step [m].
         line: (N, K + 1, 2) plan active DURING the step, with the position it was made from in front [m].
         goal: (N, 2) [m].
-        collided, reached, left, fallen: (N,) bool.
+        collided, reached, left: (N,) bool.
+        upright: (N,) z component of the body's z axis after the step, below 0 for a robot that has turned over.
     """
     vertices = path.divide(line, config.division_m)
     return {
@@ -46,7 +50,8 @@ def reward_terms(
         "collision": collided.astype(np.float64),
         "goal": reached.astype(np.float64),
         "leave_field": left.astype(np.float64),
-        "fall": fallen.astype(np.float64),
+        "tilt": np.maximum(_LEVEL - upright, 0.0),
+        "fall": (upright < 0.0).astype(np.float64),
         "goal_distance": np.linalg.norm(after - goal, axis=-1),
     }
 

@@ -154,8 +154,9 @@ class NavigationTask:
         left = ~inside(after, self._extent) & ~broken
         reached &= ~left
         collided = self.sim.collided
-        fallen = self.sim.upright < 0.0
-        terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left, fallen)
+        upright = self.sim.upright
+        fallen = upright < 0.0
+        terms = reward_terms(self.reward, before, after, line, self.goal, collided, reached, left, upright)
         if broken.any():
             terms = {name: np.where(broken, 0.0, values) for name, values in terms.items()}
         option = self._observe(None)

@@ -23,12 +23,17 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def terms_of(
-    before: object, after: object, config: RewardConfig = DEFAULT, line: np.ndarray = STRAIGHT, **events: bool
+    before: object,
+    after: object,
+    config: RewardConfig = DEFAULT,
+    line: np.ndarray = STRAIGHT,
+    upright: float = 1.0,
+    **events: bool,
 ) -> dict[str, float]:
     """The terms of one robot's step towards a goal at (2, 0)."""
-    flags = {name: np.array([events.get(name, False)]) for name in ("collided", "reached", "left", "fallen")}
+    flags = {name: np.array([events.get(name, False)]) for name in ("collided", "reached", "left")}
     ends = (np.array([end], float) for end in (before, after))
-    terms = reward_terms(config, *ends, line, np.array([[2.0, 0.0]]), **flags)
+    terms = reward_terms(config, *ends, line, np.array([[2.0, 0.0]]), **flags, upright=np.array([upright]))
     assert tuple(terms) == TERMS
     return {name: float(values[0]) for name, values in terms.items()}
 
@@ -54,7 +59,7 @@ def earned_on_a_tour(config: RewardConfig, corners: object, occupancy: Occupancy
         total = 0.0
         for position in [*tour[1:], tour[0]]:
             after = position[None]
-            terms = reward_terms(config, before, after, option.line(), goal, NO, NO, NO, NO)
+            terms = reward_terms(config, before, after, option.line(), goal, NO, NO, NO, np.ones(1))
             total += float(weighted_sum(config, terms)[0])
             option.step(after, goal, [occupancy])
             before = after
@@ -99,12 +104,20 @@ def test_straying_sideways_costs_by_default_what_coming_back_pays() -> None:
     assert terms_of((0.3, 0.2), (0.3, 0.0))["progress"] == pytest.approx(detour)
 
 
-@pytest.mark.parametrize(
-    ("event", "term"), [("collided", "collision"), ("reached", "goal"), ("left", "leave_field"), ("fallen", "fall")]
-)
+@pytest.mark.parametrize(("event", "term"), [("collided", "collision"), ("reached", "goal"), ("left", "leave_field")])
 def test_an_event_is_one_in_its_own_term_alone(event: str, term: str) -> None:
     terms, without = terms_of((0.1, 0.0), (0.2, 0.0), **{event: True}), terms_of((0.1, 0.0), (0.2, 0.0))
     assert terms == {**without, term: 1.0}
+
+
+@pytest.mark.parametrize(
+    ("upright", "tilt", "fall"), [(1.0, 0.0, 0.0), (0.8, 0.0, 0.0), (0.5, 0.3, 0.0), (-0.2, 1.0, 1.0)]
+)
+def test_a_tilted_body_is_charged_by_the_angle_and_one_on_its_back_once_more(
+    upright: float, tilt: float, fall: float
+) -> None:
+    terms = terms_of((0.1, 0.0), (0.2, 0.0), upright=upright)
+    assert terms == {**terms_of((0.1, 0.0), (0.2, 0.0)), "tilt": pytest.approx(tilt), "fall": fall}
 
 
 # the weights
