@@ -126,6 +126,10 @@ class GoseloPlanner:
         return candidates[np.arange(len(candidates)), best]
 
 
+COUNTS = ("proposals", "repairs", "loops", "detours", "refusals")
+"""What a `VerifiedPlanner` counts."""
+
+
 @dataclass
 class VerifiedPlanner:
     """Checks every proposal and replaces the bad ones by the shortest path.
@@ -188,7 +192,7 @@ class VerifiedPlanner:
 
     def counts(self) -> dict[str, int]:
         """Proposals, repairs, loops and detours among them, refusals and why, `refusals/...`, since the start."""
-        totals = {name: getattr(self, name) for name in ("proposals", "repairs", "loops", "detours", "refusals")}
+        totals = {name: getattr(self, name) for name in COUNTS}
         return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
 
     def _leads_away(self, query: PlanQuery, plan: np.ndarray, row: int) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hiernav.nav.goselo import CHANNELS
 from hiernav.nav.option import Planner, PlanQuery
-from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
+from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner, verified_planner
 from hiernav.runtime.child import wait_for_news
 from hiernav.runtime.mailbox import mapped
 from hiernav.runtime.planner_memory import PlannerMemory, Reply
@@ -90,11 +90,9 @@ def make_planner(memory: PlannerMemory) -> Planner:
     if not memory.model:
         return expert
     network = OnnxPlannerNetwork(memory.model)
-    channels = tuple(settings["channels"])
+    channels = tuple(settings["channels"]) or CHANNELS
     network(np.zeros((1, len(channels), 64, 64), np.uint8), np.ones(1, np.float32))
-    return VerifiedPlanner(
-        GoseloPlanner(network, channels or CHANNELS, settings["planning_radius_m"]), expert, settings["robot_radius"]
-    )
+    return verified_planner(network, channels, expert, settings["robot_radius"])
 
 
 def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) -> None:
@@ -119,7 +117,8 @@ def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) ->
             question.previous[None],
         )
         plan = planner.plan(query)[0]
-        memory.reply(Reply(question.number, plan, time.perf_counter() - began))
+        counts = planner.counts() if isinstance(planner, VerifiedPlanner) else {}
+        memory.reply(Reply(question.number, plan, time.perf_counter() - began, counts))
 
 
 if __name__ == "__main__":

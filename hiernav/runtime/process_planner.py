@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections import OrderedDict
+from collections import Counter, OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +73,8 @@ class ProcessPlanner:
         self._map_version = 0
         self._visits: VisitMap | None = None
         self._silent_since: float | None = None
-        self._restarting = 0
+        self._ended_counts: Counter[str] = Counter()
+        self._newest_counts: Counter[str] = Counter()
 
     @property
     def status(self) -> Status:
@@ -95,6 +97,10 @@ class ProcessPlanner:
 
     def restart_count(self) -> int:
         return self.status.restarts
+
+    def counts(self) -> dict[str, int]:
+        """Proposals, repairs, loops, detours, refusals and why (`VerifiedPlanner.counts`), as far as answers came."""
+        return dict(self._ended_counts + self._newest_counts)
 
     def renew(self) -> None:
         self._child.nudge(b"f")
@@ -125,6 +131,7 @@ class ProcessPlanner:
         if reply is not None:
             self._silent_since = None
             self.plan_time.record(reply.seconds)
+            self._count(reply.counts)
             asked = self._asked.get(reply.number)
             wanted = reply.number >= self._wanted_from
             while self._asked and next(iter(self._asked)) <= reply.number:
@@ -150,6 +157,11 @@ class ProcessPlanner:
             self._questions = -1
             self._child.close()
             os.close(self._descriptor)
+
+    def _count(self, counts: Mapping[str, int]) -> None:
+        if counts.get("proposals", 0) < self._newest_counts["proposals"]:  # it has been started again
+            self._ended_counts += self._newest_counts
+        self._newest_counts = Counter(counts)
 
     def _watch(self, now: float) -> None:
         """Have a planner that hangs started again."""

@@ -39,8 +39,10 @@ def summarise(
         realtime: what the system granted (`request_realtime`).
     """
     replans: Counter[str] = Counter()
+    plans: Counter[str] = Counter()
     for episode in episodes:
         replans.update(episode.result.replans)
+        plans.update(episode.result.planner)
     return {
         "episodes": [_episode(episode) for episode in episodes],
         "timing": {
@@ -53,6 +55,7 @@ def summarise(
             "sections": {name: histogram.summary() for name, histogram in timer.sections.items()},
         },
         "replans": dict(replans),
+        "plans": dict(plans),
         "realtime": dict(realtime),
     }
 
@@ -62,8 +65,9 @@ def print_summary(summary: Mapping[str, Any], console: Console | None = None) ->
     console = console or Console()
     console.print(_episode_table(summary["episodes"]))
     console.print(_timing_table(summary["timing"]))
-    reasons = ", ".join(f"{name} {count}" for name, count in sorted(summary["replans"].items())) or "none"
-    console.print(f"replans: {reasons}")
+    for title in ("replans", "plans"):
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(summary[title].items())) or "none"
+        console.print(f"{title}: {counts}")
     granted = ", ".join(f"{name} {text}" for name, text in summary["realtime"].items()) or "not asked"
     console.print(f"real time: {granted}", highlight=False)
 

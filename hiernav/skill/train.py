@@ -21,7 +21,7 @@ from hiernav.config import SkillConfig, TrainConfig
 from hiernav.device import choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner, TerminationReason
-from hiernav.nav.planners import VerifiedPlanner
+from hiernav.nav.planners import COUNTS, VerifiedPlanner
 from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.layout import parse_world
@@ -271,8 +271,7 @@ class SkillTrainer:
         if not isinstance(self.planner, VerifiedPlanner):
             return {}
         before, self._plans = self._plans, self.planner.counts()
-        names = ("proposals", "repairs", "loops", "detours", "refusals")
-        return {f"plans/{name}": float(self._plans[name] - before.get(name, 0)) for name in names}
+        return {f"plans/{name}": float(self._plans[name] - before.get(name, 0)) for name in COUNTS}
 
     def _next_evaluation(self) -> float:
         every = self.config.skill.eval_every_steps

@@ -31,6 +31,7 @@ def test_a_killed_planner_is_replaced_and_answers_what_was_asked():
         os.kill(planner.status.pid, signal.SIGKILL)
         np.testing.assert_allclose(ask(planner).plan, first.plan, atol=0.05)
         assert planner.restart_count() == 1 and planner.failed is None
+        assert planner.counts()["proposals"] >= 2, "counted across the restart"
     finally:
         planner.close()
 
