@@ -136,7 +136,7 @@ class Pilot:
 
     @property
     def plan_counts(self) -> dict[str, int]:
-        """Proposals, repairs, loops, detours, refusals of a planner that verifies its plans (`VerifiedPlanner.counts`)."""
+        """Counts of a planner that verifies its plans (`VerifiedPlanner.counts`)."""
         counts = getattr(self._sound.planner, "counts", None)
         return {} if counts is None else counts()
 
