@@ -200,10 +200,10 @@ class VerifiedPlanner:
         reached = np.flatnonzero(np.linalg.norm(plan - query.goal[row], axis=-1) <= self.goal_radius)
         driven = plan[: reached[0] + 1] if len(reached) else plan
         field = self.repair.field(query.occupancy[row], query.goal[row])
-        here, there = field.distance_at(np.stack([query.position[row], driven[-1]]))
+        here, there = field.distance_at(np.stack([query.position[row], driven[-1]])).tolist()
         length = arc_lengths(polyline(query.position[row][None], driven[None]))[0, -1]
         # less a cell, which is how exactly the way is known; where there is none, inf - inf speaks for no plan
-        return bool(here - there < self.least_gain * length - CELL)
+        return here - there < self.least_gain * float(length) - CELL
 
     def _leads_back(self, plan: np.ndarray, visits: VisitMap) -> bool:
         return any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])
