@@ -50,7 +50,7 @@ from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.process_planner import ProcessPlanner
-from hiernav.runtime.process_robot import ProcessRobot
+from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import Robot
 from hiernav.runtime.settings import Settings, load_settings
@@ -66,7 +66,6 @@ if TYPE_CHECKING:
 
 BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
-SIMULATED = "hiernav.runtime.sim_robot:make"
 
 
 class Drive(Observer):
@@ -196,12 +195,10 @@ def _process_robot(
 ) -> ProcessRobot:
     """The robot behind an adapter in its own process, which is closed with `stack`."""
     if arguments.adapter:
-        name, given = arguments.adapter, {}
+        robot = ProcessRobot(arguments.adapter)
     else:
         noise = asdict(settings.noise)
-        given = {"robot": spec.name, "world": arguments.world, "seed": arguments.seed, "noise": noise}
-        name = SIMULATED
-    robot = ProcessRobot(name, given)
+        robot = simulated(robot=spec.name, world=arguments.world, seed=arguments.seed, noise=noise)
     stack.callback(robot.close)
     return robot
 

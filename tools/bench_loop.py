@@ -75,14 +75,12 @@ def measure(
     from hiernav.runtime.pilot import Pilot
     from hiernav.runtime.policy import make_agent
     from hiernav.runtime.process_planner import ProcessPlanner
-    from hiernav.runtime.process_robot import ProcessRobot
+    from hiernav.runtime.process_robot import simulated
     from hiernav.runtime.realtime import RealtimeConfig, request_realtime
     from hiernav.sim.layout import parse_world
     from hiernav.sim.worlds import sample_layout
 
-    robot = ProcessRobot(
-        "hiernav.runtime.sim_robot:make", {"robot": "point", "world": WORLD, "seed": 0, "substeps": 500 // rate}
-    )
+    robot = simulated(robot="point", world=WORLD, seed=0, substeps=500 // rate)
     bundle = load_bundle(bundle_path)
     layout = sample_layout(parse_world(WORLD), 0)
     occupancy = layout.occupancy(0.0)

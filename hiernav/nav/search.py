@@ -7,12 +7,15 @@ pass where there is not. With `soft_margin = 0` the cost is the length.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from hiernav.nav.occupancy import OccupancyMap
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 CELL = 0.1  # [m], planning grid of the paper
 _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
@@ -61,6 +64,8 @@ class PathField:
             self.goal_cell = None
         self._end = self.goal
         if self.goal_cell is not None:
+            from scipy.sparse.csgraph import dijkstra  # takes longest to import, and a control loop searches nothing
+
             if not occupancy.clearance_at(self.goal) >= radius:
                 self._end = self._centers[self.goal_cell]
             graph = _grid_graph(self._free.reshape(self._shape), self._factor(clearance).reshape(self._shape))
@@ -236,6 +241,8 @@ def _nearest(centers: np.ndarray, free: np.ndarray, point: np.ndarray) -> int | 
 
 def _grid_graph(free: np.ndarray, factor: np.ndarray) -> csr_matrix:
     """Sparse graph of the free cells; an edge costs its length times the mean factor of its ends."""
+    from scipy.sparse import csr_matrix
+
     rows, cols = free.shape
     index = np.arange(rows * cols).reshape(rows, cols)
     source, target, weight = [], [], []

@@ -6,7 +6,7 @@ import os
 import select
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -19,7 +19,13 @@ class Child:
     process is gone.
     """
 
-    def __init__(self, module: str, arguments: Sequence[object] = (), descriptors: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        module: str,
+        arguments: Sequence[object] = (),
+        descriptors: Sequence[int] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         """Run `python -m module NEWS ARGUMENT ...`; NEWS is the descriptor on which `nudge` arrives."""
         news, self._news = os.pipe()
         os.set_blocking(self._news, False)
@@ -31,7 +37,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 pass_fds=(news, *descriptors),
                 start_new_session=True,
-                env={**os.environ, **ONE_THREAD, "PYTHONPATH": path},
+                env={**os.environ, **ONE_THREAD, **(environment or {}), "PYTHONPATH": path},
             )
         finally:
             os.close(news)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import chdtri
 
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch
@@ -33,8 +33,9 @@ class Estimator:
         """Stamp of the last measurement accepted from each sensor [s]."""
         self._field = math.hypot(*config.magnetic_field)
         self._field_heading = math.atan2(config.magnetic_field[1], config.magnetic_field[0])
-        self._gate_1 = float(chdtri(1, 1.0 - config.gate_probability))
-        self._gate_2 = float(chdtri(2, 1.0 - config.gate_probability))
+        # Chi-square quantiles: of one normal variable's square, and of two such, which is an exponential distribution.
+        self._gate_1 = NormalDist().inv_cdf(0.5 * (1.0 - config.gate_probability)) ** 2
+        self._gate_2 = -2.0 * math.log(1.0 - config.gate_probability)
         self.reset()
 
     def reset(self) -> None:

@@ -14,6 +14,7 @@ import sys
 import time
 
 import numpy as np
+import scipy.sparse.csgraph  # noqa: F401  by the first search, which the keeper is to have imported
 
 from hiernav.nav.goselo import CHANNELS
 from hiernav.nav.option import Planner, PlanQuery

@@ -10,6 +10,7 @@ import onnxruntime as ort
 
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, TensorSpec
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption
+from hiernav.nav.planners import ShortestPathPlanner, verified_planner
 
 GOLDEN_TOLERANCE = 1e-5
 _DTYPES: dict[str, np.dtype[Any]] = {"tensor(float)": np.dtype(np.float32), "tensor(uint8)": np.dtype(np.uint8)}
@@ -124,8 +125,6 @@ def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: floa
         network: of that bundle.
         robot_radius: disc with which plans are swept against the map [m].
     """
-    from hiernav.nav.planners import ShortestPathPlanner, verified_planner  # takes scipy along
-
     plan = bundle.manifest.plan
     expert = ShortestPathPlanner(
         plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m

@@ -17,18 +17,31 @@ from hiernav.runtime.robot_process import BRAKE, END, STATUS
 from hiernav.runtime.wire import CAPACITY, decode_frame
 
 
+def simulated(**arguments: Any) -> ProcessRobot:
+    """A simulated robot in real time in a process of its own; arguments of `hiernav.runtime.sim_robot.make`."""
+    # nothing is drawn there, and MuJoCo would take 0.1 s to find out with what
+    return ProcessRobot("hiernav.runtime.sim_robot:make", arguments, environment={"MUJOCO_GL": "off"})
+
+
 class ProcessRobot:
     """A `Robot` behind two mailboxes: reading and sending never wait for the adapter.
 
     The adapter's watchdog brakes the robot if no command comes, whether this process is slow, stopped or dead.
     """
 
-    def __init__(self, robot: str, arguments: Mapping[str, Any] | None = None, patience: float = 20.0) -> None:
+    def __init__(
+        self,
+        robot: str,
+        arguments: Mapping[str, Any] | None = None,
+        patience: float = 20.0,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         """
         Args:
             robot: what makes the robot over there: "package.module:function" or "file.py:function".
             arguments: of that function, as JSON can hold them.
             patience: time the robot may take to start, and to answer a `call` [s].
+            environment: variables of that process besides those of this one.
 
         Raises:
             RuntimeError: the adapter did not start.
@@ -47,6 +60,7 @@ class ProcessRobot:
                 "hiernav.runtime.robot_process",
                 (theirs.fileno(), self._descriptor, settings),
                 (theirs.fileno(), self._descriptor),
+                environment,
             )
         self._facts: dict[str, Any] | None = None
         self._message: bytes | None = None

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from hiernav.nav.frames import wrap_angle
+
+if TYPE_CHECKING:  # who only asks what a robot is like, such as a control loop, needs no physics
+    import mujoco
 
 MODEL_DIR = Path(__file__).parent / "models"
 BASE_SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer")

@@ -20,25 +20,44 @@ def moving_filter(seed: int) -> PlanarFilter:
     return filter_
 
 
+def general_filter(filter_: PlanarFilter) -> ExtendedKalmanFilter:
+    """filterpy's, in the state of ours."""
+    general = ExtendedKalmanFilter(dim_x=6, dim_z=2)
+    general.x, general.P = filter_.x.copy(), filter_.P.copy()
+    return general
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_uncertainty_grows_as_the_general_filter_has_it(seed):
+    ours = moving_filter(seed)
+    general = general_filter(ours)
+    ours.predict_motion(0.02, yaw_rate=1.3, yaw_sigma=0.01)
+    general.F, general.Q = ours.F, ours.Q
+    general.predict()
+    np.testing.assert_allclose(ours.P, general.P, atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("part", [POSITION, VELOCITY])
 def test_a_pair_is_fused_as_the_general_filter_does(seed, part):
-    ours, general = moving_filter(seed), moving_filter(seed)
+    ours = moving_filter(seed)
+    general = general_filter(ours)
     measured = ours.x[part] + [0.05, -0.1]
     rows = np.eye(6)[part]
     assert ours.correct_pair(part, tuple(measured - ours.x[part]), 0.04, gate=100.0)
-    ExtendedKalmanFilter.update(general, measured, lambda x: rows, lambda x: x[part], R=np.eye(2) * 0.04)
+    general.update(measured, lambda x: rows, lambda x: x[part], R=np.eye(2) * 0.04)
     np.testing.assert_allclose(ours.x, general.x, atol=1e-10)
     np.testing.assert_allclose(ours.P, general.P, atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_heading_is_fused_as_the_general_filter_does(seed):
-    ours, general = moving_filter(seed), moving_filter(seed)
+    ours = moving_filter(seed)
+    general = general_filter(ours)
     rows = np.eye(6)[YAW : YAW + 1]
     measured = ours.x[YAW : YAW + 1] + 0.1
     assert ours.correct_yaw(0.1, 0.04, gate=100.0)
-    ExtendedKalmanFilter.update(general, measured, lambda x: rows, lambda x: x[YAW : YAW + 1], R=np.eye(1) * 0.04)
+    general.update(measured, lambda x: rows, lambda x: x[YAW : YAW + 1], R=np.eye(1) * 0.04)
     np.testing.assert_allclose(np.delete(ours.x, YAW), np.delete(general.x, YAW), atol=1e-10)
     assert math.remainder(ours.x[YAW] - general.x[YAW], 2 * math.pi) == pytest.approx(0.0, abs=1e-10)
     np.testing.assert_allclose(ours.P, general.P, atol=1e-10)
