@@ -15,6 +15,7 @@ PACKAGE = Path(hiernav.__file__).parent
 # Room -> the rooms it may import. A room is a folder or a file directly under hiernav/.
 ALLOWED = {
     "__init__": {"config", "nav", "sim", "envs"},
+    "__main__": {"cli"},
     "envs": set(),
     "decode": set(),
     "config": {"decode"},
@@ -153,6 +154,16 @@ def test_deployed_scripts_name_no_training_package() -> None:
     for file in (PACKAGE.parent / "deploy").rglob("*.py"):
         packages = {module.partition(".")[0] for module in imported_modules(file.read_text(encoding="utf-8"))}
         assert not packages & TRAINING_PACKAGES, file
+
+
+def test_a_control_process_loads_neither_physics_nor_search_nor_plots() -> None:
+    """They take longer to import than all the rest together, and a robot is to be ready within moments."""
+    code = (
+        f"import sys\nsys.path.insert(0, {str(PACKAGE.parent / 'deploy')!r})\nimport run_loop\n"
+        "print(*sorted(set(sys.modules) & {'scipy', 'filterpy', 'mujoco', 'matplotlib', 'mcap', 'viser'}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == ""
 
 
 def test_importing_hiernav_on_a_robot_loads_nothing_else() -> None:
