@@ -33,7 +33,8 @@ ALLOWED = {
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
     "film": {"nav", "sim", "evaluate", "draw"},
-    "report": {"nav", "sim", "evaluate", "config", "draw"},
+    "reproduce": {"nav", "sim", "planner", "evaluate", "finetune", "training", "film", "config", "run"},
+    "report": {"nav", "sim", "evaluate", "config", "draw", "reproduce"},
     "cli": {
         "nav",
         "sim",

@@ -23,8 +23,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 PAPER = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
-BATCH, UPDATES, EPOCHS = 256, 1_000, 6
-"""Every set is seen six times, and small ones until there were 1,000 updates."""
 
 
 def main() -> int:
@@ -62,93 +60,41 @@ def main() -> int:
 
 def _run(arguments: argparse.Namespace, samples: int, preset: str, seed: int) -> dict[str, Any]:
     """Train one planner, or go on training it, and walk."""
-    import numpy as np
     import torch
 
-    from hiernav.config import load_config
-    from hiernav.planner.dataset import data_seed, label_settings
-    from hiernav.planner.store import read_manifest, write_dataset
-    from hiernav.planner.train import PlannerTrainer, torch_planner
-    from hiernav.run import Run
-    from hiernav.sim.layout import parse_world
-    from hiernav.sim.walk import walk
-    from hiernav.sim.worlds import sample_layout
+    from hiernav.planner.table import measure
 
     torch.set_num_threads(arguments.threads)
-    folder = arguments.out / _name(samples, preset, seed)
-    # the sizes are the first samples of one set for each network and seed
-    data = arguments.out / f"data-{preset}-{seed}"
-    config = load_config(
-        None,
-        [
-            f"robot={arguments.robot}",
-            f"seed={seed}",
-            f"threads={arguments.threads}",
-            f"run_dir={folder}",
-            f"planner.preset={preset}",
-            f"planner.samples={samples}",
-            f"planner.worlds={json.dumps([arguments.world])}",
-            f"planner.data={data}",
-            f"planner.epochs={_epochs(samples)}",
-            f"planner.batch_size={BATCH}",
-            *arguments.set,
-        ],
+    began, shown = time.perf_counter(), _show()
+    result = measure(
+        arguments.out,
+        samples,
+        preset,
+        seed,
+        world=arguments.world,
+        robot=arguments.robot,
+        episodes=arguments.episodes,
+        threads=arguments.threads,
+        settings=arguments.set,
+        on_progress=shown,
     )
-    run = Run.open(folder) if (folder / "config.yaml").exists() else Run.create(config)
-    if not (data / "dataset.json").exists() or read_manifest(data).samples < samples:
-        write_dataset(
-            data, label_settings(config), samples, data_seed(config), arguments.threads, _show("data set", samples)
-        )
-    trainer = PlannerTrainer(run.config, run)
-    trainer.resume()
-    began = time.perf_counter()
-    total = config.planner.epochs * samples
-    shown = _show("training", total)
-    trainer.train(lambda now: shown(now.done) if now.stage == "training" else None)
-    seconds = time.perf_counter() - began
-    run.close()
-    radius = trainer.labels.radius
-    layouts = [
-        sample_layout(parse_world(arguments.world), int(s), radius)
-        for s in np.random.SeedSequence((0x7AB1E,)).generate_state(arguments.episodes)
-    ]
-    result = walk(torch_planner(trainer.network, trainer.labels), layouts, radius)
-    return {
-        "samples": samples,
-        "preset": preset,
-        "seed": seed,
-        "world": arguments.world,
-        "robot": arguments.robot,
-        "episodes": arguments.episodes,
-        "epochs": config.planner.epochs,
-        "collisions_mean": float(result.collisions.mean()),
-        "collision_free_rate": float((result.reached & (result.collisions == 0)).mean()),
-        "reach_rate": float(result.reached.mean()),
-        "plans_mean": float(result.plans.mean()),
-        "error_m": trainer.validation["error"],
-        "train_seconds": round(seconds, 1),
-        "settings": arguments.set,
-    }
+    return {**result, "seconds": round(time.perf_counter() - began, 1), "settings": arguments.set}
 
 
-def _epochs(samples: int) -> int:
-    return max(EPOCHS, -(-UPDATES * BATCH // samples))
-
-
-def _show(what: str, total: int) -> Any:
+def _show() -> Any:
     """Progress with a rate, one line every 20 s."""
-    began, last = time.perf_counter(), time.perf_counter()
+    began: dict[str, float] = {}
+    last = time.perf_counter()
 
-    def show(done: int) -> None:
+    def show(what: str, done: int, total: int) -> None:
         nonlocal last
         now = time.perf_counter()
+        began.setdefault(what, now)
         if now - last > 20.0:
             last = now
-            rate = max(done, 1) / (now - began)
-            print(
-                f"    {what}: {done:,} of {total:,}  {rate:,.0f}/s  {(total - done) / rate / 60:.1f} min left",
-                flush=True,
-            )
+            rate = max(done, 1) / max(now - began[what], 1e-6)
+            left = (total - done) / rate / 60
+            print(f"    {what}: {done:,} of {total:,}  {rate:,.0f}/s  {left:.1f} min left", flush=True)
 
     return show
 

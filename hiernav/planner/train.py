@@ -219,7 +219,7 @@ class PlannerTrainer:
         rng = np.random.default_rng(seed)
         layouts = [
             sample_layout(mix.draw(rng), int(s), self.labels.radius)
-            for s in np.random.SeedSequence(seed).generate_state(_WALKS)
+            for s in np.random.SeedSequence(seed).generate_state(min(_WALKS, self.config.planner.samples))
         ]
         result = walk(torch_planner(self.network, self.labels), layouts, self.labels.radius)
         return {

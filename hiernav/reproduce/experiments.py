@@ -1,0 +1,300 @@
+"""Every experiment of the paper, and what it lacks, as a list of cells in the order in which they are worth running.
+
+First what needs no training (the bundles that ship), then the paper's own trainings, then ablations of our departures.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hiernav.config import TrainConfig, dump_config, load_config
+from hiernav.film.film import film_name
+from hiernav.reproduce.cells import Cell
+from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
+
+EXPERIMENTS = {
+    "table3": "Table III: reach rate and steps in six worlds; baseline, ours, fine-tuned planner",
+    "astar": "A* in the place of the learned planner (not in the paper)",
+    "replanning": "fixed periods of 4, 16 and 64 steps against the rule",
+    "ablations": "each departure from the paper switched off, or tried (not in the paper)",
+    "films": "each robot in each world, from above",
+    "table2": "Table II: collisions of plans against the number of samples",
+    "sample_efficiency": "training curves of three robots, ours against the baseline",
+    "planners": "the planners of the trained seeds, which Table III drives with",
+}
+ROBOTS = ("point", "car", "doggo")
+WORLDS = ("pillar(2,2,10)", "gremlin", "pillar(3,3,25)", "pillar(4,4,40)", "two-room", "four-room")
+SEEDS = {"point": 5, "car": 5, "doggo": 3}
+ABLATION_SEEDS = TABLE2_SEEDS = 3
+PERIODS = (4, 16, 64)
+
+SKILL_SECONDS = {"point": 600.0, "car": 900.0, "doggo": 2400.0}
+PLANNER_SECONDS = {"point": 420.0, "car": 480.0, "doggo": 420.0}
+EVALUATION_SECONDS = {"point": 25.0, "car": 55.0, "doggo": 60.0}
+FINE_TUNING_SECONDS = 120.0
+
+DRIVING = {
+    "no-repair": {"repair": False},
+    "no-recovery": {"recover": False},
+    "no-invalid-rule": {"invalid": False},
+}
+"""Departures that evaluation can switch off: settings that differ."""
+TRAINING = {
+    "paper-reward": ["reward.preset=paper"],
+    "one-world": ["skill.worlds=['pillar(2,2,10)']", "skill.phase_in=0"],
+    "no-phase-in": ["skill.phase_in=0"],
+    "no-mirror": ["skill.mirror=false"],
+    "no-average": ["skill.actor_average=0"],
+    "no-alpha-floor": ["skill.alpha_floor=0"],
+    "whole-episodes": ["skill.episode_steps=null"],
+    "go-on-after-fall": ["skill.end_on_fall=false"],
+    "no-clock": ["skill.clock=false"],
+    "layer-norm": ["skill.layer_norm=true"],
+    "learned-plans": ["skill.planner=cnn"],
+}
+"""Departures that have to be trained without (`layer-norm` and `learned-plans`: with). One that changes nothing for a
+robot is left out for it."""
+BASELINE = ["skill.preset=baseline", "skill.reward_scale=1.0"]
+"""Its rewards are as large as ours after scaling: every step costs the distance to the goal."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large everything is."""
+
+    episodes: int = 1000
+    paper_episodes: int = 200
+    worlds: tuple[str, ...] = WORLDS
+    training: tuple[str, ...] = ()
+    """Settings of every training, laid over all others."""
+    fine_tuning: tuple[str, ...] = ()
+    table2_samples: tuple[int, ...] = (1_000, 10_000, 50_000, 100_000)
+    table2_settings: tuple[str, ...] = ()
+    film_episodes: int = 2
+    share: float = 1.0
+    """Of the usual durations."""
+
+
+FULL = Size()
+_SMALL = ("planner.samples_per_world=12", "planner.epochs=1", "planner.batch_size=16")
+SMOKE = Size(
+    episodes=4,
+    paper_episodes=2,
+    worlds=("pillar(1.2,1.2,2)", "two-room(1.2,1.2)"),
+    training=(
+        *_SMALL, "planner.samples=24", "planner.worlds=['pillar(1.2,1.2,2)']", "threads=1",
+        "skill.worlds=['pillar(1.2,1.2,2)']", "skill.num_envs=4", "skill.total_steps=128", "skill.learning_starts=64",
+        "skill.updates_per_step=0.1", "skill.batch_size=16", "skill.hidden=[16, 16]", "skill.eval_every_steps=64",
+        "skill.eval_episodes=2", "skill.checkpoint_every_steps=64",
+    ),
+    fine_tuning=(*_SMALL, "planner.samples=24"),
+    table2_samples=(16, 32),
+    table2_settings=_SMALL,
+    film_episodes=1,
+    share=0.01,
+)  # fmt: skip
+"""Everything once, too small to mean anything, to see the machinery work."""
+
+
+def catalogue(root: Path, size: Size = FULL, seeds: int | None = None, robots: Sequence[str] = ROBOTS) -> list[Cell]:
+    """Every cell of some robots, in the order in which the queue runs them.
+
+    Args:
+        root: of the repository.
+        seeds: of every training, instead of five for point and car, three for the doggo, three for ablations.
+    """
+    makers = [_Maker(root, size, seeds, robot) for robot in robots]
+    cells = [cell for maker in makers for cell in maker.shipped()]
+    if "point" in robots:
+        cells += _table2(size, TABLE2_SEEDS if seeds is None else seeds)
+    cells += [cell for maker in makers for cell in maker.trained()]
+    cells += [cell for maker in makers for cell in maker.ablated()]
+    return cells
+
+
+def _table2(size: Size, seeds: int) -> list[Cell]:
+    cells = []
+    for samples in size.table2_samples:
+        for preset in ("paper", "default"):
+            for seed in range(seeds):
+                passes = max(6 * samples, 256_000)
+                settings: dict[str, Any] = {"samples": samples, "preset": preset, "episodes": size.episodes}
+                if size.table2_settings:
+                    settings["settings"] = list(size.table2_settings)
+                cells.append(
+                    Cell(
+                        experiment="table2",
+                        name=f"{preset}-{samples}-{seed}",
+                        kind="table2",
+                        robot="point",
+                        variant=preset,
+                        seed=seed,
+                        world=size.worlds[0],
+                        settings=settings,
+                        seconds=size.share * (60 + samples / 1500 + passes / 1700),
+                    )  # fmt: skip
+                )
+    return cells
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """The cells of one robot."""
+
+    root: Path
+    size: Size
+    given_seeds: int | None
+    robot: str
+
+    def shipped(self) -> list[Cell]:
+        """What the bundle that ships can be asked without training."""
+        bundle = f"deploy/bundles/{self.robot}"
+        cells = [self._evaluate("table3", "shipped", world, bundle=bundle) for world in self.size.worlds]
+        beside = {cell.world: (cell.id,) for cell in cells}
+        for world in self.size.worlds:
+            cells.append(
+                self._evaluate("astar", "astar", world, {"planner": "astar"}, bundle=bundle, needs=beside[world])
+            )
+        some = [world for world in self.size.worlds if world in (self.size.worlds[0], "gremlin", "four-room")]
+        for world in some:
+            for period in PERIODS:
+                cells.append(
+                    self._evaluate(
+                        "replanning", f"period-{period}", world, {"period": period}, bundle=bundle, needs=beside[world]
+                    )
+                )
+        for variant, settings in DRIVING.items():
+            for world in some:
+                cells.append(self._evaluate("ablations", variant, world, settings, bundle=bundle, needs=beside[world]))
+        for world in self.size.worlds:
+            cells.append(
+                Cell(
+                    experiment="films",
+                    name=f"{self.robot}-{_slug(world)}",
+                    kind="film",
+                    robot=self.robot,
+                    variant="shipped",
+                    world=world,
+                    bundle=bundle,
+                    settings={"episodes": self.size.film_episodes},
+                    seconds=self.size.share * 15.0,
+                )  # fmt: skip
+            )
+        for world in self.size.worlds:
+            cells.append(
+                self._evaluate(
+                    "table3", "shipped-finetuned", world, bundle=bundle, fine_tuned=True, needs=beside[world]
+                )
+            )
+        return cells
+
+    def trained(self) -> list[Cell]:
+        """The paper's trainings, and what is measured of them."""
+        cells, driven = [], []
+        for seed in range(self.given_seeds or SEEDS[self.robot]):
+            ours = self._train("sample_efficiency", "ours", seed, [])
+            baseline = self._train("sample_efficiency", "baseline", seed, BASELINE)
+            planner = msgspec.structs.replace(
+                ours, experiment="planners", name=f"{self.robot}-{seed}", needs=(ours.id,),
+                world=None, settings={"stage": "planner"}, seconds=self.size.share * PLANNER_SECONDS[self.robot],
+            )  # fmt: skip
+            cells += [ours, baseline, planner]
+            for world in self.size.worlds:
+                about: dict[str, Any] = {"seed": seed, "run": ours.run, "needs": (ours.id, planner.id)}
+                driven.append(self._evaluate("table3", "ours", world, **about))
+                driven.append(self._evaluate("table3", "finetuned", world, fine_tuned=True, **about))
+                driven.append(
+                    self._evaluate("table3", "baseline", world, seed=seed, run=baseline.run, needs=(baseline.id,))
+                )
+        return cells + driven
+
+    def ablated(self) -> list[Cell]:
+        """Trainings that differ from ours in one respect, and those of fixed periods."""
+        cells = []
+        ours = self._config(0, [])
+        for name, overrides in TRAINING.items():
+            cannot_fall = name == "go-on-after-fall" and not get_robot(self.robot).free_base
+            if cannot_fall or self._config(0, overrides) == ours:
+                continue
+            for seed in range(self.given_seeds or ABLATION_SEEDS):
+                cells.append(
+                    self._train("ablations", name, seed, overrides, (f"sample_efficiency/{self.robot}-ours-{seed}",))
+                )
+        for period in PERIODS:
+            for seed in range(self.given_seeds or ABLATION_SEEDS):
+                cells.append(
+                    self._train(
+                        "replanning",
+                        f"trained-period-{period}",
+                        seed,
+                        [f"option.period={period}"],
+                        (f"sample_efficiency/{self.robot}-ours-{seed}",),
+                    )  # fmt: skip
+                )
+        return cells
+
+    def _config(self, seed: int, overrides: list[str]) -> str:
+        file = self.root / "configs" / f"{self.robot}.yaml"
+        return dump_config(load_config(file, [*overrides, *self.size.training, f"seed={seed}", "run_dir=null"]))
+
+    def _train(
+        self, experiment: str, variant: str, seed: int, overrides: list[str], needs: tuple[str, ...] = ()
+    ) -> Cell:
+        config = self._config(seed, overrides)
+        name = f"{self.robot}-{variant}-{seed}"
+        both = "skill.planner=cnn" in overrides
+        seconds = SKILL_SECONDS[self.robot] + EVALUATION_SECONDS[self.robot]
+        return Cell(
+            experiment=experiment, name=name, kind="train", robot=self.robot, variant=variant, seed=seed, config=config,
+            world=self.size.worlds[0], settings={"stage": "all" if both else "skill", "episodes": self.size.episodes},
+            # another configuration is another folder: no training goes on in one of other settings
+            run=f"{name}-{hashlib.sha256(config.encode()).hexdigest()[:8]}", needs=needs,
+            seconds=self.size.share * (seconds + both * PLANNER_SECONDS[self.robot]),
+        )  # fmt: skip
+
+    def _evaluate(
+        self,
+        experiment: str,
+        variant: str,
+        world: str,
+        settings: dict[str, Any] | None = None,
+        *,
+        fine_tuned: bool = False,
+        seed: int | None = None,
+        bundle: str | None = None,
+        run: str | None = None,
+        needs: tuple[str, ...] = (),
+    ) -> Cell:
+        settings = {"episodes": self.size.episodes, "paper_episodes": self.size.paper_episodes, **(settings or {})}
+        if fine_tuned:
+            settings["fine_tuning"] = list(self.size.fine_tuning)
+        parts = [self.robot, variant, *([] if seed is None else [str(seed)]), _slug(world)]
+        return Cell(
+            experiment=experiment, name="-".join(parts), kind="finetune" if fine_tuned else "evaluate",
+            robot=self.robot, variant=variant, seed=seed, world=world, settings=settings, bundle=bundle, run=run,
+            needs=needs,
+            seconds=self.size.share * (EVALUATION_SECONDS[self.robot] + fine_tuned * FINE_TUNING_SECONDS),
+        )  # fmt: skip
+
+
+def differences(config: TrainConfig) -> dict[str, Any]:
+    """What a configuration sets differently from the defaults: "skill.total_steps" -> 100000."""
+    ours, defaults = msgspec.to_builtins(config), msgspec.to_builtins(TrainConfig())
+    found: dict[str, Any] = {}
+    for key, value in ours.items():
+        if isinstance(value, dict):
+            found |= {f"{key}.{k}": v for k, v in value.items() if v != defaults[key][k]}
+        elif value != defaults[key] and key != "run_dir":
+            found[key] = value
+    return found
+
+
+def _slug(world: str) -> str:
+    return film_name(parse_world(world))

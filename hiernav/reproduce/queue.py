@@ -1,0 +1,256 @@
+"""The queue: what is done, what is left, how long it will take, and running it."""
+
+from __future__ import annotations
+
+import fcntl
+import fnmatch
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
+from hiernav.reproduce.child import CellFailed
+from hiernav.reproduce.experiments import EXPERIMENTS
+from hiernav.reproduce.results import Machine, Result, ResultError, git_state, read_result, this_machine, write_result
+from hiernav.reproduce.work import Outcome, Report
+
+State = Literal["open", "done", "failed", "changed", "damaged"]
+"""`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
+Execute = Callable[[Cell, Places, Report], Outcome]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A cell as it stands."""
+
+    cell: Cell
+    state: State
+    result: Result | None = None
+    error: str | None = None
+
+    @property
+    def settled(self) -> bool:
+        """Whether there is nothing to do, unless failed cells are tried again."""
+        return self.state in ("done", "failed", "damaged")
+
+
+@dataclass
+class Tally:
+    """What a run of the queue came to, by cell id."""
+
+    done: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    """Cells that were not started, and why."""
+    stopped: bool = False
+
+
+class Watcher:
+    """Sees a queue run; this one looks away."""
+
+    def began(self, cell: Cell, seconds: float) -> None: ...
+
+    def progress(self, cell: Cell, share: float, what: str) -> None: ...
+
+    def ended(self, cell: Cell, result: Result | None, why: str | None) -> None: ...
+
+
+def select(cells: Sequence[Cell], only: Sequence[str] = (), training: bool = True) -> list[Cell]:
+    """Cells of some experiments, and all that they need, in order.
+
+    Args:
+        only: experiments, cells as experiment/name, or patterns of either; everything by default.
+        training: whether cells that train, or need a training, are among them.
+
+    Raises:
+        ValueError: a name fits no cell.
+    """
+    known = {cell.id: cell for cell in cells}
+    wanted = set() if only else set(known)
+    for pattern in only:
+        full = pattern if "/" in pattern else f"{pattern}/*"
+        found = set(fnmatch.filter(known, full))
+        if not found:
+            raise ValueError(f"no cell fits {pattern!r}; experiments: {', '.join(EXPERIMENTS)}; --list has all cells")
+        wanted |= found
+    needed = set[str]()
+    while wanted - needed:
+        needed |= wanted
+        wanted = {need for name in needed for need in known[name].needs if need in known} | needed
+    trained = set[str]()
+    for cell in cells:  # what is needed comes first
+        if cell.kind in TRAINING or trained.intersection(cell.needs):
+            trained.add(cell.id)
+    return [cell for cell in cells if cell.id in needed and (training or cell.id not in trained)]
+
+
+def look_up(cell: Cell, places: Places) -> Entry:
+    """How a cell stands."""
+    try:
+        result = read_result(places.results, cell.id)
+    except ResultError as error:
+        return Entry(cell, "damaged", error=str(error))
+    if result is None:
+        return Entry(cell, "open")
+    if result.key != cell_key(cell, places):
+        return Entry(cell, "changed", result)
+    film = result.metrics.get("file")
+    if film and not (places.results / "films" / film).exists():
+        return Entry(cell, "open")
+    return Entry(cell, result.state, result, result.error)
+
+
+class Estimates:
+    """Durations of cells, corrected by how long others of their kind took on this machine."""
+
+    def __init__(self, entries: Sequence[Entry], machine: Machine) -> None:
+        self._expected, self._taken = defaultdict[str, float](float), defaultdict[str, float](float)
+        for entry in entries:
+            result = entry.result
+            if (
+                result is not None
+                and entry.state == "done"
+                and (result.machine.cpu, result.machine.cores)
+                == (
+                    machine.cpu,
+                    machine.cores,
+                )
+            ):
+                self.learn(entry.cell, result.seconds)
+
+    def learn(self, cell: Cell, seconds: float) -> None:
+        self._expected[cell.kind] += cell.seconds
+        self._taken[cell.kind] += seconds
+
+    def __call__(self, cell: Cell) -> float:
+        """Seconds that a cell will take."""
+        expected = self._expected[cell.kind]
+        return cell.seconds * (self._taken[cell.kind] / expected if expected else 1.0)
+
+
+class Queue:
+    """Cells in order; `run` does those that are left.
+
+    Args:
+        execute: does a cell's work; see `hiernav.reproduce.child.run_in_process`.
+    """
+
+    def __init__(self, cells: Sequence[Cell], places: Places, execute: Execute) -> None:
+        self.cells, self.places = list(cells), places
+        self._execute = execute
+        self._machine = this_machine()
+        # of the code as it was loaded, whatever is committed while the queue runs
+        self._commit, self._dirty = git_state(places.root, places.results)
+        self.estimate = Estimates(self.entries(), self._machine)
+
+    def entries(self) -> list[Entry]:
+        """Every cell as it stands."""
+        return [look_up(cell, self.places) for cell in self.cells]
+
+    def left(self, retry: bool = False) -> list[Cell]:
+        """Cells that a run would start, those included that wait for others."""
+        return [e.cell for e in self.entries() if not e.settled or (retry and e.state != "done")]
+
+    def run(self, budget: float | None = None, retry: bool = False, watcher: Watcher | None = None) -> Tally:
+        """Run what is left. Stopping it at any time, with Ctrl-C or SIGTERM, loses an evaluation at most.
+
+        Args:
+            budget: seconds; no cell is started whose estimate does not fit into what is left of them.
+            retry: whether to run failed cells again, and those whose result file is damaged.
+        """
+        watcher, tally = watcher or Watcher(), Tally()
+        began = time.monotonic()
+        try:
+            for cell in self.left(retry):
+                why = self._why_not(cell, None if budget is None else budget - (time.monotonic() - began))
+                if why is None:
+                    with _claimed(cell, self.places) as mine:
+                        if not mine:
+                            why = "another queue runs it"
+                        elif look_up(cell, self.places).state == "done":
+                            why = "another queue has run it"
+                        else:
+                            self._run(cell, watcher, tally)
+                if why is not None:
+                    tally.skipped[cell.id] = why
+                    watcher.ended(cell, None, why)
+        except KeyboardInterrupt:
+            tally.stopped = True
+        return tally
+
+    def _run(self, cell: Cell, watcher: Watcher, tally: Tally) -> None:
+        key, started, began = cell_key(cell, self.places), time.strftime("%Y-%m-%dT%H:%M:%S%z"), time.monotonic()
+        watcher.began(cell, self.estimate(cell))
+        outcome, error = Outcome({}, {}, dict(cell.settings)), None
+        try:
+            outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what))
+        except CellFailed as failure:
+            error = str(failure)
+        seconds = time.monotonic() - began
+        if cell_key(cell, self.places) != key:
+            tally.skipped[cell.id] = why = "its bundle was replaced meanwhile: run it again"
+            watcher.ended(cell, None, why)
+            return
+        result = Result(
+            experiment=cell.experiment,
+            cell=cell.name,
+            state="done" if error is None else "failed",
+            key=key,
+            robot=cell.robot,
+            variant=cell.variant,
+            seed=cell.seed,
+            world=cell.world,
+            command=cell.command,
+            settings=outcome.settings,
+            source=outcome.source,
+            commit=self._commit,
+            dirty=self._dirty,
+            started=started,
+            seconds=round(seconds, 1),
+            machine=self._machine,
+            metrics=outcome.metrics,
+            curves=outcome.curves,
+            error=error,
+        )
+        write_result(self.places.results, result)
+        if error is None:
+            self.estimate.learn(cell, seconds)
+            tally.done.append(cell.id)
+        else:
+            tally.failed[cell.id] = error
+        watcher.ended(cell, result, None)
+
+    def _why_not(self, cell: Cell, left: float | None) -> str | None:
+        """Why a cell cannot be started, if so."""
+        known = {each.id: each for each in self.cells}
+        for need in cell.needs:
+            if need in known and (state := look_up(known[need], self.places).state) != "done":
+                return f"needs {need}, which is {state}"
+        if left is not None and (estimate := self.estimate(cell)) > left:
+            return f"takes about {duration(estimate)}, and {duration(max(left, 0.0))} are left"
+        return None
+
+
+def duration(seconds: float) -> str:
+    """ "45 s", "12 min", "3 h 20 min"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+@contextmanager
+def _claimed(cell: Cell, places: Places) -> Iterator[bool]:
+    """Whether a cell is ours to run: several queues may share their folders, and a process that dies lets go."""
+    path = places.runs / "locks" / f"{cell.claim}.lock"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+            return
+        yield True

@@ -1,0 +1,166 @@
+"""Result files, `RESULTS/<experiment>/<cell>.json`: small, checked when read, and telling where they come from."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from hiernav import __version__
+from hiernav.run import write_atomically
+
+_PACKAGES = ("numpy", "mujoco", "onnxruntime", "torch", "torchrl")
+
+
+class ResultError(ValueError):
+    """A result file that cannot be used; the message names it."""
+
+
+class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a result was made."""
+
+    cpu: str
+    cores: int
+    """That the process may use."""
+    system: str
+    versions: dict[str, str]
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What became of a cell."""
+
+    format: Literal[1] = 1
+    experiment: str
+    cell: str
+    state: Literal["done", "failed"]
+    key: str
+    """`cell_key` when it was made."""
+    robot: str
+    variant: str
+    seed: int | None
+    world: str | None
+    command: str
+    settings: dict[str, Any]
+    """What was measured, and of a training each setting that differs from the defaults."""
+    source: dict[str, Any]
+    """The policies: bundle and hashes, or run folder."""
+    commit: str | None
+    dirty: bool | None
+    """Whether tracked files differed from the commit."""
+    started: str
+    seconds: float
+    machine: Machine
+    metrics: dict[str, Any] = {}
+    curves: dict[str, list[dict[str, float | None]]] = {}
+    error: str | None = None
+
+    @property
+    def id(self) -> str:
+        return f"{self.experiment}/{self.cell}"
+
+
+def result_path(folder: Path, cell: str) -> Path:
+    """File of a cell ("experiment/name")."""
+    return folder / f"{cell}.json"
+
+
+def write_result(folder: Path, result: Result) -> Path:
+    """Write a result so that it is there as a whole or not at all. Numbers that are not finite become null."""
+    path = result_path(folder, result.id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = msgspec.json.encode(_finite(msgspec.to_builtins(result)))
+    write_atomically(path, msgspec.json.format(encoded, indent=1) + b"\n")
+    return path
+
+
+def read_result(folder: Path, cell: str) -> Result | None:
+    """The result of a cell ("experiment/name"), or None if there is none.
+
+    Raises:
+        ResultError: the file is damaged, of another format, or lies in the wrong place.
+    """
+    path = result_path(folder, cell)
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        result = msgspec.json.decode(text, type=Result)
+    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
+        raise ResultError(f"{path}: not a result of this version: {error}") from None
+    if result.id != cell:
+        raise ResultError(f"{path}: holds the result of {result.id}")
+    if (result.state == "failed") != (result.error is not None):
+        raise ResultError(f"{path}: state {result.state!r} with error {result.error!r}")
+    return result
+
+
+def read_results(folder: Path) -> tuple[list[Result], list[str]]:
+    """Every result in a folder, and a line for each file that cannot be used."""
+    results, damaged = [], []
+    for path in sorted(folder.glob("*/*.json")):
+        try:
+            result = read_result(folder, f"{path.parent.name}/{path.stem}")
+        except ResultError as error:
+            damaged.append(str(error))
+        else:
+            if result is not None:
+                results.append(result)
+    return results, damaged
+
+
+def this_machine() -> Machine:
+    """What results of this process are made on."""
+    versions = {"hiernav": __version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            pass
+    return Machine(cpu=_cpu(), cores=_cores(), system=f"{platform.system()} {platform.machine()}", versions=versions)
+
+
+def git_state(root: Path, ignored: Path) -> tuple[str | None, bool | None]:
+    """Commit of a repository and whether tracked files outside `ignored` differ from it; None and None without git."""
+    excluded = [f":(exclude){ignored.relative_to(root)}"] if ignored.is_relative_to(root) else []
+    try:
+        commit = _git(root, "rev-parse", "HEAD").strip()
+        changes = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *excluded)
+    except (OSError, subprocess.CalledProcessError):
+        return None, None
+    return commit, bool(changes.strip())
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or "unknown"
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

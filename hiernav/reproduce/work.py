@@ -1,0 +1,233 @@
+"""The work of one cell, of every kind. What trains imports torch when it runs."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from hiernav.config import OptionConfig, RewardConfig, load_config
+from hiernav.evaluate import Policies, evaluate, open_policies, summarize, under_protocol
+from hiernav.film.film import FilmSettings, make_film
+from hiernav.film.writer import default_suffix
+from hiernav.reproduce.cells import Cell, Places, bundle_hashes
+from hiernav.reproduce.experiments import differences
+from hiernav.sim.layout import parse_world
+from hiernav.sim.rollout import Episode
+
+Report = Callable[[float, str], None]
+"""Takes the share that is done, 0 to 1, and what is being done."""
+
+EVALUATION_SEED = 0
+_FILM = FilmSettings(size=240, speed=1.5, fps=10.0)
+
+
+@dataclass
+class Outcome:
+    """What a cell found out."""
+
+    metrics: dict[str, Any]
+    source: dict[str, Any]
+    settings: dict[str, Any] = field(default_factory=dict)
+    curves: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
+
+
+def run_cell(cell: Cell, places: Places, report: Report) -> Outcome:
+    """Do the work of a cell whose needs are met; a training goes on from its last checkpoint."""
+    return {
+        "evaluate": _evaluate,
+        "finetune": _fine_tune,
+        "train": _train,
+        "table2": _table2,
+        "film": _film,
+    }[cell.kind](cell, places, report)
+
+
+def driven(
+    policies: Policies, world: str, settings: Mapping[str, Any], report: Report, reward: RewardConfig | None = None
+) -> dict[str, Any]:
+    """Metrics of one drive through a world's episodes, under both protocols.
+
+    The paper's episodes are the first ones of the strict protocol's, so they are driven once.
+
+    Args:
+        settings: `episodes`, and what differs: `paper_episodes`, `planner`, `repair`, `recover`, `period`, `invalid`.
+        reward: to measure returns by, instead of the one the policies were trained with.
+    """
+    config = policies.config
+    names = {field.name for field in msgspec.structs.fields(OptionConfig)}
+    option = {name: value for name, value in settings.items() if name in names}
+    config = msgspec.structs.replace(config, option=msgspec.structs.replace(config.option, **option))
+    if reward is not None:
+        config = msgspec.structs.replace(config, reward=reward)
+    spec, episodes = parse_world(world), dict[int, Episode]()
+
+    def keep(_: str, number: int, episode: Episode) -> None:
+        episodes[number] = episode
+        report(len(episodes) / settings["episodes"], f"{len(episodes)} of {settings['episodes']} episodes")
+
+    found = evaluate(
+        Policies(config, policies.skill, policies.network, policies.channels),
+        [spec],
+        "strict",
+        settings.get("planner", "cnn"),
+        settings["episodes"],
+        EVALUATION_SEED,
+        settings.get("repair", True),
+        on_episode=keep,
+        recover=settings.get("recover", True),
+    )[str(spec)]
+    found.pop("seconds")
+    done = [episodes[number] for number in sorted(episodes)]
+    metrics = {"strict": {**found, **_more(done)}}
+    if count := settings.get("paper_episodes"):
+        counted = under_protocol(done[:count], "paper", spec)
+        metrics["paper"] = {**summarize(counted), **_more(counted)}
+    return metrics
+
+
+def _more(episodes: list[Episode]) -> dict[str, Any]:
+    """What the summary of an evaluation lacks: half widths of 95 % intervals, and steps between plans."""
+    values: dict[str, list[float]] = {
+        "steps": [e.steps_counted for e in episodes],
+        "collisions": [e.collisions for e in episodes],
+        "spl": [e.spl for e in episodes],
+    }
+    plans = sum(sum(count for reason, count in e.replans.items() if reason != "goal") for e in episodes)
+    return {
+        **{f"{name}_half95": _half_width(each) for name, each in values.items()},
+        "steps_between_plans": sum(e.steps for e in episodes) / plans if plans else None,
+    }
+
+
+def _half_width(values: list[float]) -> float | None:
+    known = np.array(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return 1.96 * float(known.std(ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else None
+
+
+def _policies(cell: Cell, places: Places) -> tuple[Path, dict[str, Any]]:
+    """Folder of a cell's policies, and what a result says of them."""
+    if cell.bundle is not None:
+        folder = places.root / cell.bundle
+        return folder, {"bundle": cell.bundle, "sha256": bundle_hashes(folder)}
+    assert cell.run is not None, cell.id
+    return places.runs / cell.run, {"run": cell.run}
+
+
+def _evaluate(cell: Cell, places: Places, report: Report) -> Outcome:
+    assert cell.world is not None
+    folder, source = _policies(cell, places)
+    return Outcome(driven(open_policies(folder), cell.world, cell.settings, report), source, cell.settings)
+
+
+def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
+    """Fine-tune the planner on the cell's world, then drive there."""
+    from hiernav.finetune import begin_fine_tuning, fine_tuning_config
+    from hiernav.reproduce.cells import cell_key
+
+    assert cell.world is not None
+    source, about = _policies(cell, places)
+    folder = places.runs / f"{cell.experiment}-{cell.name}-{cell_key(cell, places)[:8]}"
+    if not (folder / "planner" / "checkpoint.pt").exists():
+        # begun and not even saved: there is nothing to go on with
+        (folder / "config.yaml").unlink(missing_ok=True)
+        overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
+        begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
+    _train_run(folder, "planner", report)
+    metrics = driven(open_policies(folder), cell.world, cell.settings, report)
+    return Outcome(metrics, {**about, "fine_tuned": folder.name}, cell.settings)
+
+
+def _train(cell: Cell, places: Places, report: Report) -> Outcome:
+    """Train the skill, then drive with A* plans; or train the planner of a run whose skill is trained."""
+    from hiernav.run import Run
+
+    assert cell.run is not None and cell.config is not None
+    folder, stage = places.runs / cell.run, cell.settings["stage"]
+    if not (folder / "config.yaml").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        given = folder / "given.yaml"
+        given.write_text(cell.config)
+        Run.create(load_config(given, [f"run_dir={folder}"])).close()
+    _train_run(folder, stage, report)
+    if stage == "planner":
+        curves = {"planner": _curve(folder, "planner")}
+        metrics: dict[str, Any] = {"last": curves["planner"][-1]}
+    else:
+        curves = {"evaluation": _curve(folder, "evaluation")}
+        # returns of all trainings by the baseline's reward, as in the paper
+        reward = load_config(None, ["skill.preset=baseline"]).reward
+        settings = {**cell.settings, "planner": "astar"}
+        best = json.loads((folder / "summary.json").read_text())["skill"]
+        found = driven(open_policies(folder), cell.world or "", settings, report, reward)
+        metrics = {"best": {key: value for key, value in best.items() if key != "seconds"}, **found}
+    return Outcome(metrics, {"run": cell.run}, {**cell.settings, **differences(Run.open(folder).config)}, curves)
+
+
+def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
+    from hiernav.planner.table import measure
+
+    assert cell.world is not None and cell.seed is not None
+    wanted = cell.settings
+
+    def show(what: str, done: int, total: int) -> None:
+        report(done / total, f"{what}: {done:,} of {total:,}")
+
+    folder = places.runs / "table2"
+    more = {"world": cell.world, "episodes": wanted["episodes"], "settings": wanted.get("settings", ())}
+    found = measure(folder, wanted["samples"], wanted["preset"], cell.seed, **more, on_progress=show)
+    return Outcome(found, {"run": "table2"}, wanted)
+
+
+def _film(cell: Cell, places: Places, report: Report) -> Outcome:
+    assert cell.world is not None
+    folder, source = _policies(cell, places)
+    file, count = places.results / "films" / f"{cell.name}{default_suffix()}", cell.settings["episodes"]
+    episodes = make_film(
+        open_policies(folder),
+        parse_world(cell.world),
+        file,
+        episodes=count,
+        seed=EVALUATION_SEED,
+        settings=_FILM,
+        on_episode=lambda number, _: report((number + 1) / count, f"{number + 1} of {count} episodes"),
+    )
+    metrics = {"file": file.name, "bytes": file.stat().st_size, "reached": sum(e.reached for e in episodes)}
+    return Outcome(metrics, source, cell.settings)
+
+
+def _train_run(folder: Path, stage: str, report: Report) -> None:
+    """Train a stage of a run folder from its last checkpoint on."""
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    from hiernav.run import Run
+    from hiernav.training import train
+
+    class Reporting(Progress):
+        """Bars that are not drawn here but reported."""
+
+        def update(self, task_id: TaskID, **changes: Any) -> None:
+            super().update(task_id, **changes)
+            task = self.tasks[task_id]
+            report(task.completed / (task.total or 1.0), f"{task.description}: {changes.get('note', '')}")
+
+    run = Run.open(folder)
+    try:
+        train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True))
+    finally:
+        run.close()
+
+
+def _curve(folder: Path, stage: str) -> list[dict[str, float | None]]:
+    """What a run logged of a stage: `step` and values."""
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "stage"} for line in lines if line["stage"] == stage]

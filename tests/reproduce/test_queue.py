@@ -1,0 +1,221 @@
+"""Claims about the queue: nothing is run twice, nothing is lost, and a failure is seen."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from hiernav.reproduce.cells import Cell, Places
+from hiernav.reproduce.child import CellFailed
+from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
+from hiernav.reproduce.queue import Queue, duration, look_up, select
+from hiernav.reproduce.results import ResultError, read_result, read_results, result_path
+from hiernav.reproduce.work import Outcome
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Places:
+    return Places(tmp_path, tmp_path / "results", tmp_path / "runs")
+
+
+def cell(name: str, seconds: float = 10.0, **changes) -> Cell:
+    given = {"experiment": "astar", "kind": "evaluate", "robot": "point", "variant": "astar", "world": "gremlin"}
+    return Cell(name=name, seconds=seconds, **{**given, "settings": {"episodes": 5}, **changes})
+
+
+class Work:
+    """In the place of the work of cells: notes what it is asked for, and does what it is told to."""
+
+    def __init__(self, **errors: BaseException) -> None:
+        self.errors, self.calls = errors, []
+
+    def __call__(self, cell, places, report):
+        self.calls.append(cell.name)
+        report(0.5, "half of it")
+        if cell.name in self.errors:
+            raise self.errors[cell.name]
+        return Outcome({"strict": {"reach_rate": 0.75}}, {"bundle": "b"}, cell.settings)
+
+
+def test_what_was_run_is_not_run_again(places):
+    work = Work()
+    cells = [cell("a"), cell("b")]
+    assert Queue(cells, places, work).run().done == ["astar/a", "astar/b"]
+    assert Queue(cells, places, work).run().done == []
+    assert work.calls == ["a", "b"]
+    result = read_result(places.results, "astar/a")
+    assert result.metrics == {"strict": {"reach_rate": 0.75}} and result.state == "done"
+    assert result.command == "python tools/reproduce.py --only astar/a"
+    assert result.machine.cores >= 1 and result.machine.cpu and "mujoco" in result.machine.versions
+
+
+def test_a_queue_that_is_stopped_goes_on_where_it_was(places):
+    cells = [cell("a"), cell("b"), cell("c")]
+    tally = Queue(cells, places, Work(b=KeyboardInterrupt())).run()
+    assert tally.stopped and tally.done == ["astar/a"] and not tally.failed
+    work = Work()
+    assert not Queue(cells, places, work).run().stopped
+    assert work.calls == ["b", "c"]
+
+
+def test_a_failure_is_recorded_and_the_rest_goes_on(places):
+    cells = [cell("a"), cell("b", needs=("astar/a",)), cell("c")]
+    tally = Queue(cells, places, Work(a=CellFailed("ValueError: no such world"))).run()
+    assert tally.done == ["astar/c"] and tally.failed == {"astar/a": "ValueError: no such world"}
+    assert tally.skipped == {"astar/b": "needs astar/a, which is failed"}
+    assert read_result(places.results, "astar/a").error == "ValueError: no such world"
+    work = Work()
+    queue = Queue(cells, places, work)
+    assert [entry.state for entry in queue.entries()] == ["failed", "open", "done"]
+    queue.run()
+    assert work.calls == [], "a failed cell was run again unasked"
+    queue.run(retry=True)
+    assert work.calls == ["a", "b"]
+    assert {entry.state for entry in queue.entries()} == {"done"}
+
+
+def test_no_cell_is_started_that_does_not_fit_into_the_budget(places):
+    work = Work()
+    tally = Queue([cell("long", 1e6), cell("short", 50.0)], places, work).run(budget=100.0)
+    assert work.calls == ["short"]
+    assert list(tally.skipped) == ["astar/long"]
+    assert tally.skipped["astar/long"].startswith(f"takes about {duration(1e6)}")
+    assert read_result(places.results, "astar/long") is None
+
+
+def test_estimates_follow_what_cells_of_a_kind_took(places):
+    queue = Queue([cell("a", 10.0), cell("film", 10.0, kind="film")], places, Work())
+    queue.estimate.learn(cell("a", 10.0), 30.0)
+    assert queue.estimate(cell("b", 20.0)) == pytest.approx(60.0)
+    assert queue.estimate(cell("film", 20.0, kind="film")) == 20.0
+
+
+def test_other_settings_make_a_cell_open_again(places):
+    Queue([cell("a")], places, Work()).run()
+    other = cell("a", settings={"episodes": 6})
+    assert look_up(other, places).state == "changed"
+    work = Work()
+    Queue([other], places, work).run()
+    assert work.calls == ["a"] and look_up(other, places).state == "done"
+    longer = msgspec.structs.replace(other, seconds=99.0)
+    assert look_up(longer, places).state == "done", "an estimate is not a setting"
+
+
+def test_another_bundle_makes_its_cells_open_again(places):
+    shutil.copytree(ROOT / "deploy/bundles/point", places.root / "bundle")
+    cells = [cell("a", bundle="bundle"), cell("b")]
+    Queue(cells, places, Work()).run()
+    with (places.root / "bundle" / "skill.onnx").open("ab") as file:
+        file.write(b"!")
+    assert [look_up(each, places).state for each in cells] == ["changed", "done"]
+
+
+def test_a_bundle_that_is_replaced_during_a_cell_leaves_no_result(places):
+    shutil.copytree(ROOT / "deploy/bundles/point", places.root / "bundle")
+
+    def work(cell, places, report):
+        (places.root / "bundle" / "skill.onnx").write_bytes(b"another")
+        return Outcome({}, {})
+
+    tally = Queue([cell("a", bundle="bundle")], places, work).run()
+    assert not tally.done and "replaced" in tally.skipped["astar/a"]
+    assert read_result(places.results, "astar/a") is None
+
+
+def test_two_queues_do_not_work_on_the_same_cell(places):
+    work = Work()
+    lock = places.runs / "locks" / "astar-a.lock"
+    lock.parent.mkdir(parents=True)
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        tally = Queue([cell("a"), cell("b")], places, work).run()
+    assert work.calls == ["b"] and "another queue" in tally.skipped["astar/a"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "part"),
+    [
+        (lambda text: text[: len(text) // 2], "not a result of this version"),
+        (lambda text: "", "not a result of this version"),
+        (lambda text: text.replace('"metrics"', '"metrix"'), "metrix"),
+        (lambda text: text.replace('"seconds": ', '"seconds": "soon", "x": '), "seconds"),
+        (lambda text: text.replace('"state": "done"', '"state": "failed"'), "state 'failed' with error None"),
+        (lambda text: text.replace('"cell": "a"', '"cell": "b"'), "holds the result of astar/b"),
+    ],
+)
+def test_a_damaged_result_is_named_and_neither_used_nor_overwritten(places, damage, part):
+    queue = Queue([cell("a"), cell("c")], places, Work())
+    queue.run()
+    path = result_path(places.results, "astar/a")
+    text = damage(path.read_text())
+    path.write_text(text)
+    results, damaged = read_results(places.results)
+    assert [result.id for result in results] == ["astar/c"]
+    assert len(damaged) == 1 and str(path) in damaged[0] and part in damaged[0]
+    with pytest.raises(ResultError, match="a.json"):
+        read_result(places.results, "astar/a")
+    assert [entry.state for entry in queue.entries()] == ["damaged", "done"]
+    queue.run()
+    assert path.read_text() == text
+    queue.run(retry=True)
+    assert queue.entries()[0].state == "done"
+
+
+def test_numbers_that_are_not_finite_are_written_as_unknown(places):
+    nothing = float("nan")
+    Queue([cell("a")], places, lambda *_: Outcome({"error": nothing}, {}, {}, {"c": [{"x": nothing}]})).run()
+    result = read_result(places.results, "astar/a")
+    assert result.metrics == {"error": None} and result.curves == {"c": [{"x": None}]}
+    json.loads(result_path(places.results, "astar/a").read_text(), parse_constant=pytest.fail)
+
+
+@pytest.mark.parametrize("size", [FULL, SMOKE], ids=["full", "smoke"])
+def test_the_catalogue_is_whole_and_in_an_order_that_can_be_run(size):
+    cells = catalogue(ROOT, size)
+    seen: set[str] = set()
+    for each in cells:
+        assert each.id not in seen
+        assert set(each.needs) <= seen, each.id
+        seen.add(each.id)
+    assert {each.experiment for each in cells} == set(EXPERIMENTS)
+    for robot in ROBOTS:
+        seeds = {each.seed for each in cells if each.robot == robot and each.experiment == "sample_efficiency"}
+        assert len(seeds) == {"point": 5, "car": 5, "doggo": 3}[robot]
+        for variant in ("baseline", "ours", "finetuned"):
+            worlds = [c.world for c in cells if (c.experiment, c.robot, c.variant) == ("table3", robot, variant)]
+            assert set(worlds) == set(size.worlds) and len(worlds) == len(size.worlds) * len(seeds)
+    assert {each.seed for each in catalogue(ROOT, size, seeds=4)} == {None, 0, 1, 2, 3}
+    assert {each.robot for each in catalogue(ROOT, size, robots=["car"])} == {"car"}
+
+
+def test_an_ablation_differs_from_ours_and_its_folder_too():
+    cells = catalogue(ROOT, seeds=1)
+    for robot in ROBOTS:
+        trained = [c for c in cells if c.robot == robot and c.kind == "train" and c.experiment != "planners"]
+        assert len({c.config for c in trained}) == len({c.run for c in trained}) == len(trained) > 5
+
+
+def test_what_needs_no_training_can_be_had_alone():
+    cells = select(catalogue(ROOT), training=False)
+    assert {each.kind for each in cells} == {"evaluate", "film"}
+    assert {each.experiment for each in cells} == {"table3", "astar", "replanning", "ablations", "films"}
+    assert all(each.bundle for each in cells)
+
+
+def test_a_choice_brings_what_it_needs():
+    cells = catalogue(ROOT)
+    chosen = select(cells, ["table3/doggo-finetuned-0-gremlin"])
+    assert [each.id for each in chosen] == [
+        "sample_efficiency/doggo-ours-0", "planners/doggo-0", "table3/doggo-finetuned-0-gremlin"
+    ]  # fmt: skip
+    assert {each.experiment for each in select(cells, ["table2"])} == {"table2"}
+    assert len(select(cells, ["table3/*-shipped-gremlin"])) == 3
+    with pytest.raises(ValueError, match="no cell fits 'table4'.*table3"):
+        select(cells, ["table4"])

@@ -1,0 +1,171 @@
+"""Claims about the work of cells, on real policies and tiny trainings, and about the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hiernav.evaluate import evaluate, open_policies
+from hiernav.reproduce.cells import Cell, Places
+from hiernav.reproduce.child import CellFailed, run_in_process
+from hiernav.reproduce.experiments import SMOKE, catalogue
+from hiernav.reproduce.results import read_result, read_results
+from hiernav.reproduce.work import driven, run_cell
+from hiernav.sim.layout import parse_world
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "tools" / "reproduce.py"
+POINT = ROOT / "deploy" / "bundles" / "point"
+
+
+def reproduce(*arguments: object, **options) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600, **options)
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Places:
+    return Places(ROOT, tmp_path / "results", tmp_path / "runs")
+
+
+def test_the_papers_protocol_is_the_first_episodes_of_the_strict_one():
+    policies = open_policies(POINT)
+    world = "gremlin(1.5,1.5,3)"
+    together = driven(policies, world, {"episodes": 6, "paper_episodes": 3}, lambda *_: None)
+    for protocol, episodes in (("strict", 6), ("paper", 3)):
+        alone = evaluate(policies, [parse_world(world)], protocol, episodes=episodes)[world]
+        assert alone.items() >= {
+            key: value for key, value in together[protocol].items() if key in alone and key not in ("seconds",)
+        }.items()  # fmt: skip
+    assert together["paper"]["collisions_mean"] == 0.0
+
+
+def test_a_fixed_period_is_what_lies_between_plans():
+    policies = open_policies(POINT)
+    settings = {"episodes": 2, "period": 7, "invalid": False}
+    strict = driven(policies, "pillar(1.2,1.2,1)", settings, lambda *_: None)["strict"]
+    assert 6.0 < strict["steps_between_plans"] <= 7.0
+    ruled = driven(policies, "pillar(1.2,1.2,1)", {"episodes": 2}, lambda *_: None)["strict"]
+    assert ruled["steps_between_plans"] > 12.0
+
+
+@pytest.mark.train
+def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys):
+    size = replace(SMOKE, training=(*SMOKE.training, "skill.total_steps=192"))
+    cell = next(c for c in catalogue(ROOT, size, 1, ["point"]) if c.id == "sample_efficiency/point-ours-0")
+
+    def stop(share: float, what: str) -> None:
+        if share > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cell, places, stop)
+    capsys.readouterr()
+    outcome = run_cell(cell, places, lambda *_: None)
+    assert "going on after step 64 of 192" in capsys.readouterr().out
+    assert [point["step"] for point in outcome.curves["evaluation"]] == [64, 128, 192]
+    assert outcome.settings["skill.total_steps"] == 192 and "run_dir" not in outcome.settings
+    assert outcome.metrics["strict"]["planner"] == "astar"
+
+
+def test_an_error_in_a_cells_process_is_its_failure(places):
+    cell = Cell(
+        experiment="astar", name="a", kind="evaluate", robot="point", variant="astar", seconds=1.0,
+        world="gremlin", bundle="deploy/bundles/nothing", settings={"episodes": 1},
+    )  # fmt: skip
+    with pytest.raises(CellFailed, match="deploy/bundles/nothing"):
+        run_in_process(cell, places, lambda *_: None)
+    log = places.runs / "logs" / "astar-a.log"
+    assert "Traceback" in log.read_text()
+
+
+def test_a_process_that_dies_is_a_failure_that_names_the_signal(places):
+    cell = next(c for c in catalogue(ROOT, robots=["point"]) if c.id == "table3/point-shipped-gremlin")
+
+    def kill(share: float, what: str) -> None:
+        import multiprocessing
+
+        (child,) = multiprocessing.active_children()
+        child.kill()
+
+    with pytest.raises(CellFailed, match="SIGKILL"):
+        run_in_process(cell, places, kill)
+
+
+def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, str(SCRIPT), "--only", "table3/point-shipped-gremlin", "--results", str(tmp_path / "results"),
+         "--runs", str(tmp_path / "runs")],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    log = tmp_path / "runs" / "logs" / "table3-point-shipped-gremlin.log"
+    deadline = time.monotonic() + 300.0
+    while not log.exists():  # its process is at work
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 130 and "the same command goes on" in out
+    assert read_results(tmp_path / "results") == ([], [])
+
+
+@pytest.mark.train
+def test_the_command_trains_drives_and_films_and_does_not_repeat_itself(tmp_path):
+    wanted = ("--smoke", "--robots", "point", "--results", tmp_path / "results", "--runs", tmp_path / "runs",
+              "--only", "table3/point-*-pillar*", "films/*-2", "table2/*-16-0")  # fmt: skip
+    listed = json.loads(reproduce(*wanted, "--list", "--json").stdout)
+    done = reproduce(*wanted, "--json")
+    assert done.returncode == 0, done.stderr
+    tally = json.loads(done.stdout)
+    assert tally["done"] == [entry["cell"] for entry in listed]
+    results, damaged = read_results(tmp_path / "results")
+    assert not damaged and {result.id for result in results} == set(tally["done"])
+    assert {(r.experiment, r.variant) for r in results} >= {
+        ("table3", "shipped"), ("table3", "shipped-finetuned"), ("table3", "ours"), ("table3", "finetuned"),
+        ("table3", "baseline"), ("sample_efficiency", "ours"), ("sample_efficiency", "baseline"), ("table2", "paper"),
+        ("table2", "default"), ("films", "shipped"), ("planners", "ours"),
+    }  # fmt: skip
+    film = read_result(tmp_path / "results", "films/point-pillar-1.2-1.2-2")
+    assert (tmp_path / "results" / "films" / film.metrics["file"]).stat().st_size == film.metrics["bytes"] > 1000
+    again = reproduce(*wanted, "--json")
+    assert json.loads(again.stdout) == {"done": [], "failed": {}, "skipped": {}, "stopped": False}
+    assert {entry["state"] for entry in json.loads(reproduce(*wanted, "--list", "--json").stdout)} == {"done"}
+
+
+@pytest.mark.slow
+@pytest.mark.train
+def test_every_cell_can_be_run(tmp_path):
+    done = reproduce("--smoke", "--results", tmp_path / "results", "--runs", tmp_path / "runs", "--json")
+    assert done.returncode == 0, done.stderr
+    tally = json.loads(done.stdout)
+    assert not tally["failed"] and not tally["skipped"]
+    assert len(tally["done"]) == len(catalogue(ROOT, SMOKE, 1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--budget", "soon"], "write 45m, 3h or 1h30m"),
+        (["--seeds", "0"], "must be at least 1"),
+        (["--only", "table4", "--list"], "no cell fits 'table4'"),
+        (["--robots", "ant"], "invalid choice"),
+    ],
+)
+def test_bad_input_is_one_error_that_says_what_to_do(arguments, part):
+    done = reproduce(*arguments)
+    assert done.returncode == 2 and part in done.stderr and "Traceback" not in done.stderr
+
+
+def test_help_lists_every_experiment():
+    text = reproduce("--help").stdout
+    for word in ("table2", "sample_efficiency", "table3", "replanning", "astar", "ablations", "--budget", "--smoke"):
+        assert word in text
