@@ -9,10 +9,11 @@ from numpy.testing import assert_allclose
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
 from hiernav.nav.option import HierarchicalAgent, PlanQuery, WaypointOption
-from hiernav.nav.recovery import Recovery, way_out
+from hiernav.nav.recovery import Recovery, ways_out
 
 PERIOD = 0.1
-WINDOW, DURATION = 15, 10
+WINDOW, TRY, WAYS = 15, 5, 6
+DURATION = TRY * WAYS  # of a recovery that moves nothing
 AHEAD = 0.1 * np.arange(1, 11)[None, :, None] * [1.0, 0.0]
 FAR = AHEAD + [9.0, 0.0]
 FREE = empty_map((3.0, 3.0))
@@ -25,13 +26,24 @@ def drive(recovery: Recovery, positions: np.ndarray, plan: np.ndarray = AHEAD) -
     return [recovery(pose[None], plan, [FREE]) is not plan for pose in poses]
 
 
-def test_a_robot_that_stands_gets_a_way_out_for_a_moment_and_is_then_watched_anew() -> None:
+def test_a_robot_that_stands_is_shown_one_way_out_after_the_other_and_is_then_watched_anew() -> None:
     recovery = Recovery(1, PERIOD)
-    helped = drive(recovery, np.zeros((2 * (WINDOW + 1) + 10, 2)))
+    helped = drive(recovery, np.zeros((2 * WINDOW + 2 * DURATION, 2)))
     begins = [t for t in range(1, len(helped)) if helped[t] and not helped[t - 1]]
-    assert begins == [WINDOW, 2 * WINDOW + 1]
-    assert sum(helped[: WINDOW + 12]) == DURATION
+    assert begins == [WINDOW, 2 * WINDOW + DURATION + 1]
+    assert sum(helped[: begins[1]]) == DURATION
     assert recovery.counts.tolist() == [2]
+
+
+def test_the_way_on_which_it_moves_is_followed_for_as_long_again_and_is_the_last() -> None:
+    recovery, ways = Recovery(1, PERIOD), []
+    for t in range(WINDOW + DURATION):
+        moved = max(0, t - WINDOW - TRY)  # on the second way
+        followed = recovery(np.array([[-0.02 * moved, 0.0, 0.0]]), AHEAD, [FREE])
+        ways.append(None if followed is AHEAD else tuple(np.sign(followed[0, -1].round(6) - [-0.02 * moved, 0.0])))
+    assert ways[WINDOW : WINDOW + TRY] == [(1.0, 0.0)] * TRY
+    assert ways[WINDOW + TRY : WINDOW + 3 * TRY] == [(-1.0, 0.0)] * 2 * TRY
+    assert ways[WINDOW + 3 * TRY] is None
 
 
 def test_half_a_metre_away_the_plan_is_followed_again() -> None:
@@ -58,7 +70,7 @@ def test_a_robot_whose_position_is_unknown_is_not_stuck() -> None:
 
 def test_after_three_recoveries_in_one_place_it_is_given_up() -> None:
     recovery = Recovery(1, PERIOD)
-    helped = drive(recovery, np.zeros((8 * WINDOW, 2)))
+    helped = drive(recovery, np.zeros((14 * WINDOW, 2)))
     assert sum(helped) == 3 * DURATION
     assert recovery.given_up.tolist() == [True]
     assert recovery.counts.tolist() == [3]
@@ -66,10 +78,10 @@ def test_after_three_recoveries_in_one_place_it_is_given_up() -> None:
 
 def test_coming_clear_of_the_place_gives_new_tries() -> None:
     recovery = Recovery(1, PERIOD)
-    drive(recovery, np.zeros((8 * WINDOW, 2)))
+    drive(recovery, np.zeros((14 * WINDOW, 2)))
     drive(recovery, np.stack([np.linspace(0.0, 0.6, 20), np.zeros(20)], axis=1), FAR)
     assert not recovery.given_up.any()
-    assert sum(drive(recovery, np.full((8 * WINDOW, 2), (0.6, 0.0)), FAR)) == 3 * DURATION
+    assert sum(drive(recovery, np.full((14 * WINDOW, 2), (0.6, 0.0)), FAR)) == 3 * DURATION
 
 
 def test_each_robot_is_watched_for_itself_and_a_reset_forgets() -> None:
@@ -118,42 +130,62 @@ def test_the_end_of_a_recovery_is_told_once_and_asks_for_another_plan() -> None:
     assert asked == [0, WINDOW + DURATION + 1]
 
 
-# the way out
+# the ways out
 
 
-def way(plan: np.ndarray, yaw: float = 0.0, other: bool = False, occupancy: OccupancyMap = FREE) -> np.ndarray:
-    return way_out(np.array([0.0, 0.0, yaw]), plan, occupancy, 0.1, other)
+def ways(plan: np.ndarray, yaw: float = 0.0, occupancy: OccupancyMap = FREE) -> list[np.ndarray]:
+    return ways_out(np.array([0.0, 0.0, yaw]), plan, occupancy, 0.1)
 
 
-def test_the_way_out_is_straight_ahead_or_straight_back_whichever_is_nearer_to_the_plan() -> None:
-    assert_allclose(way(AHEAD[0]), AHEAD[0], atol=1e-12)
-    assert_allclose(way(-AHEAD[0]), -AHEAD[0], atol=1e-12)
-    left = AHEAD[0][:, ::-1]
-    assert_allclose(way(left, yaw=np.pi / 4), AHEAD[0] @ [[1, 1], [-1, 1]] / np.sqrt(2), atol=1e-12)
+def bearings(ways: list[np.ndarray], yaw: float = 0.0) -> list[int]:
+    """Relative to the heading [deg], counter-clockwise, 180 for straight back."""
+    degrees = [np.degrees(np.arctan2(way[-1, 1], way[-1, 0]) - yaw) for way in ways]
+    return [round(180.0 - (180.0 - value) % 360.0) for value in degrees]
 
 
-def test_the_next_try_goes_the_other_way() -> None:
-    assert_allclose(way(AHEAD[0], other=True), -AHEAD[0], atol=1e-12)
-    recovery = Recovery(1, PERIOD)
-    followed = [recovery(np.zeros((1, 3)), AHEAD, [FREE])[0, -1, 0] for _ in range(3 * WINDOW)]
-    assert followed[WINDOW] == pytest.approx(1.0) and followed[2 * WINDOW + 1] == pytest.approx(-1.0)
+@pytest.mark.parametrize(
+    ("plan", "order"),
+    [
+        ((1.0, 0.1), [0, 180, 90, -90, 45, -45, 135, -135]),
+        ((1.0, -0.1), [0, 180, -90, 90, -45, 45, -135, 135]),
+        ((-1.0, 0.1), [180, 0, 90, -90, 135, -135, 45, -45]),
+        ((-1.0, -0.1), [180, 0, -90, 90, -135, 135, -45, 45]),
+    ],
+)
+@pytest.mark.parametrize("yaw", [0.0, 0.9, -2.7])
+def test_ways_out_lead_straight_to_all_sides_the_plan_s_first(plan: object, order: list[int], yaw: float) -> None:
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    found = ways(0.1 * np.arange(1, 11)[:, None] * plan @ turn, yaw)
+    assert bearings(found, yaw) == order
+    spacing = 0.1 * np.hypot(1.0, 0.1)
+    assert_allclose([np.linalg.norm(way, axis=1) for way in found], np.tile(spacing * np.arange(1, 11), (8, 1)))
 
 
-def test_the_way_out_ends_where_the_map_is_not_free() -> None:
+def test_the_next_recovery_in_one_place_begins_where_the_last_one_ended() -> None:
+    recovery, seen = Recovery(1, PERIOD), []
+    for _ in range(2 * (WINDOW + DURATION)):
+        followed = recovery(np.zeros((1, 3)), AHEAD, [FREE])
+        seen += [] if followed is AHEAD else bearings([followed[0]])
+    assert seen[::TRY] == [0, 180, 90, -90, 45, -45, 135, -135, 0, 180, 90, -90]
+
+
+def test_a_way_out_ends_where_the_map_is_not_free() -> None:
     walled = empty_map((3.0, 3.0))
     draw_discs(walled.occupied, walled.origin, walled.resolution, np.array([[0.75, 0.0]]), 0.2)
-    out = way(AHEAD[0], occupancy=walled)
+    out = ways(AHEAD[0], occupancy=walled)[0]
     assert out[:, 0].max() == pytest.approx(0.4) and walled.is_free(out, 0.1).all()
     assert_allclose(out[4:], np.broadcast_to(out[3], (6, 2)))
 
 
-def test_a_way_that_is_blocked_at_once_is_not_taken_if_the_other_is_free() -> None:
+def test_ways_that_are_blocked_at_once_come_last() -> None:
     walled = empty_map((3.0, 3.0))
     draw_discs(walled.occupied, walled.origin, walled.resolution, np.array([[0.45, 0.0]]), 0.2)
-    assert_allclose(way(AHEAD[0], occupancy=walled), -AHEAD[0], atol=1e-12)
+    found = ways(AHEAD[0], occupancy=walled)
+    assert bearings(found[:1]) == [180]
+    assert np.linalg.norm(found[-1][-1]) < 0.2
 
 
 def test_a_robot_that_is_walled_in_stays() -> None:
     walled = empty_map((3.0, 3.0))
     walled.occupied[:] = True
-    assert_allclose(way(AHEAD[0], occupancy=walled), np.zeros((10, 2)), atol=1e-12)
+    assert_allclose(ways(AHEAD[0], occupancy=walled), np.zeros((8, 10, 2)), atol=1e-12)
