@@ -21,10 +21,11 @@ def world_to_body(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
         (N, K, 2) body frame [m].
     """
     delta = points - pose[:, None, :2]
-    cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
+    x, y, yaw = delta[..., 0], delta[..., 1], pose[:, 2:]
+    cos, sin = np.cos(yaw), np.sin(yaw)
     out = np.empty(delta.shape)
-    out[..., 0] = cos * delta[..., 0] + sin * delta[..., 1]
-    out[..., 1] = cos * delta[..., 1] - sin * delta[..., 0]
+    np.add(cos * x, sin * y, out=out[..., 0])
+    np.subtract(cos * y, sin * x, out=out[..., 1])
     return out
 
 

@@ -86,6 +86,8 @@ class ReplanRule:
         else:
             too_far, used_up = np.isnan(distance), age >= self.period
         reason = np.zeros(len(distance), dtype=np.int8)
+        if not np.count_nonzero(used_up | too_far | blocked | at_goal | ~started):
+            return reason
         # the last one that holds stays: from the least to the most important
         reason[used_up] = _HALF_INDEX
         reason[too_far] = _D_UPDATE
@@ -175,6 +177,7 @@ class WaypointOption:
 
     def __post_init__(self) -> None:
         shape = (self.num_rows, self.num_waypoints, 2)
+        self._all_rows = np.arange(self.num_rows)
         self.plan = np.full(shape, np.nan)
         self.start = np.full((self.num_rows, 2), np.nan)
         self.started = np.zeros(self.num_rows, dtype=bool)
@@ -245,60 +248,79 @@ class WaypointOption:
         Returns:
             The step of those M rows.
         """
-        rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
+        # a slice of all rows is read and written in a fraction of the time that an array of their numbers takes
+        pick: slice | np.ndarray = slice(None) if rows is None else np.asarray(rows)
+        rows = self._all_rows[pick]
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
         for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
             if visits is None:
                 visits = self.visits[row] = VisitMap(now)
             visits.enter(*where)
-        self.age[rows] += 1
-        reason = self._reasons(rows, position, goal, occupancy)
-        ended = (reason != _NONE) & (reason != _GOAL)
-        # a plan that is waited for has ended once, however often it is asked for
-        waiting = self.waiting[rows]
-        due = np.flatnonzero(ended | (waiting & (reason != _GOAL)))
-        reason[waiting & ended] = _NONE
-        self.counts[rows, reason] += 1
-        replanned = self._adopted[rows]
-        self._adopted[rows] = False
+        self.age[pick] += 1
+        reason = self._reasons(rows, pick, position, goal, occupancy)
+        due = self._due(pick, reason)
+        if np.count_nonzero(reason):
+            self.counts[rows, reason] += 1
+        else:
+            self.counts[pick, _NONE] += 1
+        replanned = self._adopted[pick].copy()
+        self._adopted[pick] = False
         began = time.perf_counter()
         if len(due):
             replanned[due] |= self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
-        return OptionStep(reason, self.plan[rows], self.start[rows], replanned, time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        return OptionStep(reason, self.plan[pick].copy(), self.start[pick].copy(), replanned, seconds)
 
     def line(self) -> np.ndarray:
         """(N, K + 1, 2) active plans with the position they were made from in front."""
         return path.polyline(self.start, self.plan)
 
+    def _due(self, pick: slice | np.ndarray, reason: np.ndarray) -> np.ndarray:
+        """Which of the rows ask for a plan now; a plan that is waited for has ended once, however often it is asked."""
+        waiting = self.waiting[pick]
+        if not (np.count_nonzero(reason) or np.count_nonzero(waiting)):
+            return self._all_rows[:0]
+        ended = (reason != _NONE) & (reason != _GOAL)
+        due = np.flatnonzero(ended | (waiting & (reason != _GOAL)))
+        reason[waiting & ended] = _NONE
+        return due
+
     def _reasons(
-        self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
+        self,
+        rows: np.ndarray,
+        pick: slice | np.ndarray,
+        position: np.ndarray,
+        goal: np.ndarray,
+        occupancy: Sequence[OccupancyMap],
     ) -> np.ndarray:
-        index, distance = path.nearest_vertex(position[:, None], path.polyline(self.start[rows], self.plan[rows]))
-        blocked = self._sweep(rows, occupancy) >= np.maximum(index[:, 0], 1)
-        # on the map it was made for and where it was made, a blocked plan would only be proposed again
-        moved = np.linalg.norm(position - self.start[rows], axis=-1) > 0.05
-        blocked &= (self.age[rows] > 1) & (moved | self._changed[rows])
+        index, distance = path.nearest_vertex(position[:, None], path.polyline(self.start[pick], self.plan[pick]))
+        self._sweep(rows, occupancy)
+        blocked = self._hit[pick] >= np.maximum(index[:, 0], 1)
+        if np.count_nonzero(blocked):
+            # on the map it was made for and where it was made, a blocked plan would only be proposed again
+            moved = path.distances(position, self.start[pick]) > 0.05
+            blocked &= (self.age[pick] > 1) & (moved | self._changed[pick])
         return self.rule(
             distance[:, 0],
             index[:, 0],
             self.num_waypoints,
-            age=self.age[rows],
+            age=self.age[pick],
             blocked=blocked,
-            at_goal=np.linalg.norm(position - goal, axis=-1) <= self.goal_radius,
-            started=self.started[rows],
+            at_goal=path.distances(position, goal) <= self.goal_radius,
+            started=self.started[pick],
         )
 
-    def _sweep(self, rows: np.ndarray, occupancy: Sequence[OccupancyMap]) -> np.ndarray:
-        """Last waypoint, counted from 1, of each row's plan that meets its map; 0 if none does: (M,)."""
-        if self.rule.invalid:
-            for row, now in zip(rows.tolist(), occupancy, strict=True):
-                if self._swept[row] is not now:
-                    met = np.flatnonzero(~now.is_free(self.plan[row], self.sweep_radius))
-                    self._hit[row] = met[-1] + 1 if len(met) else 0
-                    self._changed[row] = now is not self._planned_on[row]
-                    self._swept[row] = now
-        return self._hit[rows]
+    def _sweep(self, rows: np.ndarray, occupancy: Sequence[OccupancyMap]) -> None:
+        """Find the last waypoint that meets the map, where plan or map are new."""
+        if not self.rule.invalid:
+            return
+        for row, now in zip(rows.tolist(), occupancy, strict=True):
+            if self._swept[row] is not now:
+                met = np.flatnonzero(~now.is_free(self.plan[row], self.sweep_radius))
+                self._hit[row] = met[-1] + 1 if len(met) else 0
+                self._changed[row] = now is not self._planned_on[row]
+                self._swept[row] = now
 
     def _replan(
         self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]
@@ -383,6 +405,7 @@ class HierarchicalAgent:
     def __post_init__(self) -> None:
         self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
+        self._clocked = "clock" in self.layout.names
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
@@ -408,18 +431,21 @@ class HierarchicalAgent:
         step = self.option.step(pose[:, :2], goal, occupancy)
         plan = self.recovery(pose, step.plan, occupancy)
         self.option.waiting |= self.recovery.ended
-        observation = self.layout.build(guided(terms, pose, plan, goal, self._steps * self.control_period))
+        time_ = self._steps * self.control_period if self._clocked else None
+        observation = self.layout.build(guided(terms, pose, plan, goal, time_))
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
 
 
 def guided(
-    terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray, time: np.ndarray
+    terms: Mapping[str, np.ndarray], pose: np.ndarray, plan: np.ndarray, goal: np.ndarray, time: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Add what guides the skill to its sensors: waypoints and goal in the present body frame, and the gait clock.
 
-    `time` (N,) is that since the start of each episode [s].
+    `time` (N,) is that since the start of each episode [s]; None for a skill without a clock.
     """
     guides = world_to_body(np.concatenate([plan, np.asarray(goal, dtype=np.float64)[:, None]], axis=1), pose)
-    waypoints = guides[:, :-1].reshape(len(pose), -1)
-    return {**terms, "waypoints": waypoints, "goal": guides[:, -1], "clock": clock_phase(time)}
+    values = {**terms, "waypoints": guides[:, :-1].reshape(len(pose), -1), "goal": guides[:, -1]}
+    if time is not None:
+        values["clock"] = clock_phase(time)
+    return values

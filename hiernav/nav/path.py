@@ -71,8 +71,13 @@ def nearest_vertex(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray
     Returns:
         index (N, M) of the first nearest vertex, distance (N, M) [m]; NaN points give a NaN distance.
     """
-    squared = np.square(points[:, :, None, :] - vertices[:, None, :, :]).sum(-1)
+    squared = _squared(points[:, :, None, :] - vertices[:, None, :, :])
     return squared.argmin(-1), np.sqrt(squared.min(-1))
+
+
+def distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(..., 2), (..., 2) -> (...) [m]; NaN where one is not known."""
+    return np.sqrt(_squared(points - others))
 
 
 def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, spacing: float) -> np.ndarray:
@@ -127,6 +132,12 @@ def signed_progress(points: np.ndarray, line: np.ndarray, lookahead: float = 0.5
 def _length(vectors: np.ndarray) -> np.ndarray:
     """Lengths of (..., 2): few rows are the rule here, and `np.linalg.norm` takes its time to begin."""
     return np.hypot(vectors[..., 0], vectors[..., 1])
+
+
+def _squared(vectors: np.ndarray) -> np.ndarray:
+    # of two components, a reduction takes longer to begin than to sum; what came in is not needed any more
+    vectors *= vectors
+    return vectors[..., 0] + vectors[..., 1]
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.path import distances
 
 _LEAST_FREE = 2
 """Waypoints of a way out that must be free for it to be tried before those that are blocked at once."""
@@ -63,6 +64,8 @@ class Recovery:
         self.active = np.zeros(num_rows, dtype=bool)
         self.ended = np.zeros(num_rows, dtype=bool)
         self.given_up = np.zeros(num_rows, dtype=bool)
+        self._quiet = True
+        """Whether nobody has been helped lately: of all this, only the trail is in use."""
 
     def reset(self, rows: np.ndarray | slice | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
@@ -78,7 +81,7 @@ class Recovery:
 
     def ask(self, row: int) -> None:
         """Help a robot at the next call, whether it has stood still or not; within the same limits."""
-        self._asked[row] = True
+        self._asked[row], self._quiet = True, False
 
     def __call__(
         self, pose: np.ndarray, plan: np.ndarray, occupancy: Sequence[OccupancyMap], rows: np.ndarray | None = None
@@ -98,12 +101,14 @@ class Recovery:
         position, slot = pose[:, :2], self._tick[rows] % self._trail.shape[1]
         self._tick[rows] += 1
         # comparisons with NaN, where the window is not full or a position unknown, are False
-        moved = np.linalg.norm(position - self._trail[rows, slot], axis=-1)
+        still = distances(position, self._trail[rows, slot]) < self.least_m
         self._trail[rows, slot] = position
-        self._tries[rows[np.linalg.norm(position - self._place[rows], axis=-1) > self.clear_m]] = 0
-        ahead = np.linalg.norm(plan[:, -1] - position, axis=-1)
+        if self._quiet and not np.count_nonzero(still):
+            return plan
+        self._tries[rows[distances(position, self._place[rows]) > self.clear_m]] = 0
+        ahead = distances(plan[:, -1], position)
         idle = self._ways_left[rows] == 0
-        stuck = ((moved < self.least_m) & (ahead > self.least_m) | self._asked[rows]) & idle
+        stuck = (still & (ahead > self.least_m) | self._asked[rows]) & idle
         self._asked[rows] = False
         self.given_up[rows] = stuck & (self._tries[rows] >= self.limit)
         for k in np.flatnonzero(~idle).tolist():
@@ -113,6 +118,7 @@ class Recovery:
         active = self._ways_left[rows] > 0
         self.ended[:] = False
         self.ended[rows], self.active[rows] = self.active[rows] & ~active, active
+        self._quiet = not (self._tries.any() or self._asked.any() or self.active.any() or self.ended.any())
         if not active.any():
             return plan
         followed = plan.copy()
