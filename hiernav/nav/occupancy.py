@@ -63,6 +63,11 @@ class OccupancyMap:
         x, y = points[..., 0], points[..., 1]
         return (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
 
+    def holds(self, x: float, y: float) -> bool:
+        """`contains` for one point."""
+        xmin, xmax, ymin, ymax = self.extent
+        return xmin <= x <= xmax and ymin <= y <= ymax
+
     def occupied_at(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Points (..., 2) [m] -> (...) bool: True where the pixel holding the point is occupied, and outside."""
         points = np.asarray(points, dtype=np.float64)

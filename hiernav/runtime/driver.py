@@ -325,11 +325,12 @@ class Driver:
             self.pilot.drop()
 
     def _is_over(self, trip: Trip, estimate: Estimate, occupancy: OccupancyMap, now: float) -> bool:
-        position = estimate.pose[:2]
-        trip.distance = math.dist(position, trip.goal)
+        x, y, _ = estimate.pose.tolist()
+        goal_x, goal_y = trip.goal.tolist()
+        trip.distance = math.dist((x, y), (goal_x, goal_y))
         if trip.distance <= self.config.goal_radius:
             self._end_trip("goal", now)
-        elif not occupancy.contains(position):
+        elif not occupancy.holds(x, y):
             self._end_trip("left_field", now)
         elif trip.steps >= trip.max_steps:
             self._end_trip("timeout", now)

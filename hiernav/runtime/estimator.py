@@ -36,6 +36,8 @@ class Estimator:
         # Chi-square quantiles: of one normal variable's square, and of two such, which is an exponential distribution.
         self._gate_1 = NormalDist().inv_cdf(0.5 * (1.0 - config.gate_probability)) ** 2
         self._gate_2 = -2.0 * math.log(1.0 - config.gate_probability)
+        self._limits = [(name, config.hold_after, config.lost_after) for name in VECTOR_SENSORS]
+        self._limits.append(("position_fix", config.fix_hold_after, config.fix_lost_after))
         self.reset()
 
     def reset(self) -> None:
@@ -266,12 +268,12 @@ class Estimator:
 
     def _trust(self) -> tuple[Trust, str]:
         """What the estimate is good for, judged by the sensor that has been silent for too long."""
-        config = self.config
-        limits = dict.fromkeys(VECTOR_SENSORS, (config.hold_after, config.lost_after))
         worst, why = Trust.GOOD, ""
-        for name, (hold, lost) in (limits | {"position_fix": (config.fix_hold_after, config.fix_lost_after)}).items():
+        for name, hold, lost in self._limits:
             silence = self._watch.silence(name, self._stamp)
-            trust = Trust.LOST if silence >= lost else Trust.HOLD if silence >= hold else Trust.GOOD
+            if silence < hold:
+                continue
+            trust = Trust.LOST if silence >= lost else Trust.HOLD
             if trust > worst:
                 worst, why = trust, f"{name} says nothing new for {silence:.2f} s"
         return worst, why

@@ -123,8 +123,9 @@ class ProcessRobot:
         self.child.nudge()
 
     def truth(self) -> Truth | None:
-        """Of a simulated robot, at the newest frame; None of a real one."""
-        self.read()
+        """Of a simulated robot, at the frame that was read last; None of a real one."""
+        if self._newest is None:
+            self.read()
         return None if self._newest is None else self._newest[1]
 
     def call(self, method: str, **arguments: Any) -> Any:

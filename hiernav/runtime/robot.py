@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 VECTOR_SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
+_TERMS = (*VECTOR_SENSORS, "lidar")
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,9 @@ class SensorFrame:
 
     def terms(self) -> dict[str, np.ndarray]:
         """Every observation term that this frame has, by name, 1-D each."""
-        present = {name: getattr(self, name) for name in (*VECTOR_SENSORS, "lidar")}
-        return {name: value for name, value in present.items() if value is not None} | dict(self.extra)
+        present = {name: value for name in _TERMS if (value := getattr(self, name)) is not None}
+        present.update(self.extra)
+        return present
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,15 @@ class TermHold:
 
     def fill(self, frame: SensorFrame) -> dict[str, np.ndarray]:
         """Terms by name, (1, d) each. A sensor that never gave a good value reads zero, one never seen is absent."""
-        present = frame.terms()
+        present, last = frame.terms(), self._last
         for name, value in present.items():
             value = np.asarray(value, dtype=np.float64).reshape(1, -1)
-            good = np.isfinite(value)
-            if not good.all():
-                self.held += 1
-                value = np.where(good, value, self._last.get(name, np.zeros_like(value)))
-            self._last[name] = value
-        self.held += sum(name not in present for name in self._last)
-        return dict(self._last)
+            # the square of the length is finite only if every component is: one short call instead of three
+            if not np.vdot(value, value) < np.inf:
+                good = np.isfinite(value)
+                self.held += not good.all()
+                value = np.where(good, value, last.get(name, np.zeros_like(value)))
+            last[name] = value
+        if len(last) > len(present):
+            self.held += len(last) - len(present)
+        return dict(last)
