@@ -30,6 +30,8 @@ from hiernav.runtime.trip import RunResult, Trip
 from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, PlanWatch, SaturationWatch, StopWatch
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
+REHEARSALS = 2
+"""Rehearsals of a tick: after the first its memory is at hand, after the second its branches are foreseen too."""
 FLUSH_SECONDS = 1.0
 """What observers are given to bring their data to safety once the robot is braked [s]."""
 MAX_SATURATED = 3
@@ -250,7 +252,8 @@ class Driver:
             rehearse = getattr(self.robot, "rehearse", None)
             if rehearse is not None:
                 rehearse()
-            self._rehearsal(frame, estimate, trip.goal, occupancy)
+            for _ in range(REHEARSALS):
+                self._rehearsal(frame, estimate, trip.goal, occupancy)
         except Exception:
             log.exception("the rehearsal failed and is dropped")
             self.loop.drop_preparation()

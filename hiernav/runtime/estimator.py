@@ -10,7 +10,7 @@ import numpy as np
 
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch
-from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, wrap
+from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
 
@@ -46,7 +46,7 @@ class Estimator:
         # A body that shivers at rest, sampled in step with it, would otherwise pass for a gyro of any bias.
         self._filter = PlanarFilter(config.velocity_walk, config.bias_walk, 3.0 * config.bias_sigma)
         self._filter.replace(VELOCITY, (0.0, 0.0), 1.0)
-        self._filter.replace(slice(BIAS, BIAS + 1), (0.0,), config.bias_sigma**2)
+        self._filter.replace((BIAS,), (0.0,), config.bias_sigma**2)
         self._tilt = TiltFilter(
             dip_sine=config.magnetic_field[2] / self._field,
             gyro_walk=0.3,
@@ -168,11 +168,11 @@ class Estimator:
         variance = (self.config.magnetometer_sigma / level) ** 2 + 1e-4
         if not self._has_yaw:
             self._has_yaw = True
-            self._filter.replace(slice(YAW, YAW + 1), (wrap(yaw),), variance)
+            self._filter.replace((YAW,), (wrap(yaw),), variance)
         elif not self._filter.correct_yaw(miss := wrap(yaw - self._filter.yaw), variance, self._gate_1):
             if not self._reject("magnetometer", (miss,)):
                 return
-            self._filter.replace(slice(YAW, YAW + 1), (wrap(yaw),), variance)
+            self._filter.replace((YAW,), (wrap(yaw),), variance)
         self._accept("magnetometer")
 
     def _correct_velocity(self, velocity: Vector | None, forward: Vector, left: Vector) -> None:
@@ -181,7 +181,7 @@ class Estimator:
         ahead, aside = dot(velocity, forward), dot(velocity, left)
         tilt_variance = self._tilt.sigma**2 * dot(velocity, velocity) if self.config.tilts else 0.0
         variance = self.config.velocimeter_sigma**2 + min(tilt_variance, 1.0)
-        _, _, _, vx, vy, _ = self._filter.x.tolist()
+        _, _, _, vx, vy, _ = self._filter.x
         miss = (ahead - vx, aside - vy)
         if not self._filter.correct_pair(VELOCITY, miss, variance, self._gate_2):
             if not self._reject("velocimeter", miss):
@@ -190,7 +190,7 @@ class Estimator:
         self._accept("velocimeter")
 
     def _remember(self) -> None:
-        x, y = self._filter.x[POSITION].tolist()
+        x, y = self._filter.x[:2]
         self._history.append([self._stamp, x, y])
         while self._history[0][0] < self._stamp - self.config.history:
             self._history.popleft()
@@ -213,15 +213,15 @@ class Estimator:
         then = self._position_at(stamp)
         miss = (fix[0] - then[0], fix[1] - then[1])
         variance = self.config.fix_sigma**2
-        before = self._filter.x[POSITION]
+        x, y = self._filter.x[:2]
         if self._has_position and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
-            self._shift_history(stamp, self._filter.x[POSITION] - before)
+            self._shift_history(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
         elif self._has_position and not self._reject("position_fix", miss):
             return
         else:
             self._has_position = True
-            self._filter.replace(POSITION, before + miss, variance)
-            self._shift_history(-math.inf, np.array(miss))
+            self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
+            self._shift_history(-math.inf, *miss)
         self._accept("position_fix")
 
     def _position_at(self, stamp: float) -> tuple[float, float]:
@@ -234,9 +234,8 @@ class Estimator:
             later = entry
         return later[1], later[2]
 
-    def _shift_history(self, stamp: float, change: np.ndarray) -> None:
+    def _shift_history(self, stamp: float, dx: float, dy: float) -> None:
         """Let the past know of a correction, so that the next late fix is not compared with what is already mended."""
-        dx, dy = change.tolist()
         for entry in reversed(self._history):
             if entry[0] < stamp:
                 break
@@ -279,14 +278,14 @@ class Estimator:
         return worst, why
 
     def _estimate(self) -> Estimate:
-        x, y, yaw, ahead, aside, bias = self._filter.x.tolist()
+        x, y, yaw, ahead, aside, bias = self._filter.x
         cos, sin = math.cos(yaw), math.sin(yaw)
         trust, why = self._trust()
         return Estimate(
             stamp=self._stamp,
             pose=np.array([x, y, yaw]),
             velocity=np.array([cos * ahead - sin * aside, sin * ahead + cos * aside]),
-            covariance=self._filter.P.copy(),
+            covariance=np.array(self._filter.P),
             upright=self._tilt.up[2],
             yaw_rate=self._yaw_rate - bias,
             trust=trust,

@@ -1,26 +1,25 @@
 """Extended Kalman filter of a robot's planar motion, gated before every update.
 
-The tests hold it against filterpy's `ExtendedKalmanFilter`. The control process does without filterpy itself: none of
-its methods would be called, and with the parts of scipy that it imports it took half of the time that a robot needs to
-start.
+Six numbers and their covariance are too few for numpy, whose calls take longer to begin than these sums take in plain
+Python; and plain sums give the same on every processor. The tests hold the filter against filterpy's
+`ExtendedKalmanFilter`, none of whose methods would be called here, and whose import took as long as all the rest of a
+control process's start.
 """
 
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from collections.abc import Iterable, Sequence
 
 X, Y, YAW, VX, VY, BIAS = range(6)
-POSITION = slice(X, Y + 1)
-VELOCITY = slice(VX, VY + 1)
+POSITION = (X, Y)
+VELOCITY = (VX, VY)
 
 
 class PlanarFilter:
-    """State (6,): x, y [m], yaw [rad], velocity in the heading frame (forward, left) [m/s], yaw gyro bias [rad/s].
+    """State: x, y [m], yaw [rad], velocity in the heading frame (forward, left) [m/s], yaw gyro bias [rad/s].
 
-    The model is written out for this state, at a fraction of the time that a general `predict` and `update` take. A
-    measurement must pass a chi-square gate before it may touch the state.
+    A measurement must pass a chi-square gate before it may touch the state.
     """
 
     def __init__(self, velocity_walk: float, bias_walk: float, max_bias: float = math.inf) -> None:
@@ -30,20 +29,17 @@ class PlanarFilter:
             bias_walk: random walk of the gyro's bias [rad/s per sqrt(s)].
             max_bias: no gyro's bias is larger [rad/s].
         """
-        self.x = np.zeros(6)
-        self.P = np.eye(6)
-        """(6, 6) covariance of the state."""
-        self.F = np.eye(6)
-        """(6, 6) Jacobian of the last motion."""
-        self.Q = np.zeros((6, 6))
-        """(6, 6) covariance of the last motion's noise."""
+        self.x = [0.0] * 6
+        """State (6,)."""
+        self.P = [[float(row == column) for column in range(6)] for row in range(6)]
+        """Its covariance (6, 6), symmetric to the bit."""
         self._velocity_density = velocity_walk**2
         self._bias_density = bias_walk**2
         self._max_bias = max_bias
 
     @property
     def yaw(self) -> float:
-        return float(self.x[YAW])
+        return self.x[YAW]
 
     def predict_motion(self, dt: float, yaw_rate: float, yaw_sigma: float) -> None:
         """Move on by `dt` [s].
@@ -53,34 +49,40 @@ class PlanarFilter:
             yaw_rate: measured turning rate with its bias, mean over the interval [rad/s].
             yaw_sigma: uncertainty of the turn, besides the bias [rad].
         """
-        x, y, yaw, vx, vy, bias = self.x.tolist()
+        x, y, yaw, vx, vy, bias = self.x
         turn = (yaw_rate - bias) * dt
         cos, sin = math.cos(yaw + 0.5 * turn), math.sin(yaw + 0.5 * turn)
-        dx, dy = (cos * vx - sin * vy) * dt, (sin * vx + cos * vy) * dt
-        self.x = np.array([x + dx, y + dy, wrap(yaw + turn), vx, vy, bias])
-
-        jacobian = self.F
-        jacobian[X, YAW], jacobian[Y, YAW], jacobian[YAW, BIAS] = -dy, dx, -dt
-        jacobian[X, VX] = jacobian[Y, VY] = cos * dt
-        jacobian[Y, VX] = sin * dt
-        jacobian[X, VY] = -sin * dt
+        c, s = cos * dt, sin * dt
+        dx, dy = c * vx - s * vy, s * vx + c * vy
+        self.x = [x + dx, y + dy, wrap(yaw + turn), vx, vy, bias]
 
         # Position and velocity noise are correlated, as an integrated random walk: a later velocity reading then also
         # corrects the position, which is the trapezoidal rule.
-        density, noise = self._velocity_density, self.Q
-        noise[X, X] = noise[Y, Y] = density * dt**3 / 3.0
-        noise[VX, VX] = noise[VY, VY] = density * dt
-        half = 0.5 * density * dt**2
-        noise[X, VX] = noise[VX, X] = noise[Y, VY] = noise[VY, Y] = half * cos
-        noise[Y, VX] = noise[VX, Y] = half * sin
-        noise[X, VY] = noise[VY, X] = -half * sin
-        noise[YAW, YAW] = yaw_sigma**2
-        noise[BIAS, BIAS] = self._bias_density * dt
+        density = self._velocity_density
+        place, half, walk = density * dt**3 / 3.0, 0.5 * density * dt**2, density * dt
 
-        covariance = jacobian @ self.P @ jacobian.T + noise
-        self.P = 0.5 * (covariance + covariance.T)
+        # F P F' + Q, where the Jacobian F adds to x: -dy yaw + c vx - s vy, to y: dx yaw + s vx + c vy, to yaw: -dt bias
+        on_x, on_y, on_yaw, on_vx, on_vy, on_bias = self.P
+        of_yaw = zip(on_yaw, on_vx, on_vy, on_x, on_y, strict=True)
+        moved = [(a - dy * h + c * v - s * w, b + dx * h + s * v + c * w) for h, v, w, a, b in of_yaw]
+        (xx, _), (xy, yy), (xh, yh), (xv, yv), (xw, yw), (xb, yb) = moved
+        _, _, hh, hv, hw, hb = (h - dt * g for h, g in zip(on_yaw, on_bias, strict=True))
+        xx, yy = xx - dy * xh + c * xv - s * xw + place, yy + dx * yh + s * yv + c * yw + place
+        xy = xy + dx * xh + s * xv + c * xw
+        xh, yh, hh = xh - dt * xb, yh - dt * yb, hh - dt * hb + yaw_sigma**2
+        xv, xw, yv, yw = xv + half * cos, xw - half * sin, yv + half * sin, yw + half * cos
+        vv, vw, vb = on_vx[VX] + walk, on_vx[VY], on_vx[BIAS]
+        ww, wb, bb = on_vy[VY] + walk, on_vy[BIAS], on_bias[BIAS] + self._bias_density * dt
+        self.P = [
+            [xx, xy, xh, xv, xw, xb],
+            [xy, yy, yh, yv, yw, yb],
+            [xh, yh, hh, hv, hw, hb],
+            [xv, yv, hv, vv, vw, vb],
+            [xw, yw, hw, vw, ww, wb],
+            [xb, yb, hb, vb, wb, bb],
+        ]
 
-    def correct_pair(self, part: slice, residual: tuple[float, float], variance: float, gate: float) -> bool:
+    def correct_pair(self, part: tuple[int, int], residual: tuple[float, float], variance: float, gate: float) -> bool:
         """Update with a measurement of position or velocity.
 
         Args:
@@ -92,44 +94,61 @@ class PlanarFilter:
         Returns:
             Whether the measurement was accepted; if not, nothing has changed.
         """
-        columns = self.P[:, part]
-        (a, b), (_, d) = columns[part].tolist()
-        a, d = a + variance, d + variance
+        p, q = (self.P[index] for index in part)
+        a, b, d = p[part[0]] + variance, p[part[1]], q[part[1]] + variance
         determinant = a * d - b * b
         first, second = residual
         distance = (d * first * first - 2.0 * b * first * second + a * second * second) / determinant
         if not 0.0 <= distance <= gate:
             return False
-        inverse = np.array([[d, -b], [-b, a]]) / determinant
-        gain = columns @ inverse
-        self._apply(gain @ residual, gain @ columns.T)
+        gains = [((u * d - v * b) / determinant, (v * a - u * b) / determinant) for u, v in zip(p, q, strict=True)]
+        self._apply([k * first + m * second for k, m in gains])
+        self.P = _mirrored(
+            [row[j] - k * p[j] - m * q[j] for j in range(i + 1)]
+            for i, (row, (k, m)) in enumerate(zip(self.P, gains, strict=True))
+        )
         return True
 
     def correct_yaw(self, residual: float, variance: float, gate: float) -> bool:
         """Update with a measured heading; arguments as in `correct_pair`, `residual` in [-pi, pi)."""
-        column = self.P[:, YAW]
-        spread = float(column[YAW]) + variance
+        column = self.P[YAW]
+        spread = column[YAW] + variance
         if not 0.0 <= residual * residual / spread <= gate:
             return False
-        self._apply(column * (residual / spread), (column / spread)[:, None] * column)
+        gains = [u / spread for u in column]
+        self._apply([k * residual for k in gains])
+        self.P = _mirrored(
+            [row[j] - k * column[j] for j in range(i + 1)] for i, (row, k) in enumerate(zip(self.P, gains, strict=True))
+        )
         return True
 
-    def replace(self, part: slice, value: np.ndarray | tuple[float, ...], variance: float) -> None:
+    def replace(self, part: Sequence[int], value: Sequence[float], variance: float) -> None:
         """Forget a part of the state and its correlations, and start it at `value` with `variance`."""
-        self.x[part] = value
-        self.P[part, :] = 0.0
-        self.P[:, part] = 0.0
-        size = len(range(*part.indices(6)))
-        self.P[part, part] = np.eye(size) * variance
+        for index, number in zip(part, value, strict=True):
+            self.x[index] = number
+            for other in range(6):
+                self.P[index][other] = self.P[other][index] = 0.0
+            self.P[index][index] = variance
 
-    def _apply(self, change: np.ndarray, reduction: np.ndarray) -> None:
-        self.x = self.x + change
-        self.x[YAW] = wrap(float(self.x[YAW]))
-        self.x[BIAS] = min(max(float(self.x[BIAS]), -self._max_bias), self._max_bias)
-        covariance = self.P - reduction
-        self.P = 0.5 * (covariance + covariance.T)
+    def _apply(self, change: list[float]) -> None:
+        self.x = [value + by for value, by in zip(self.x, change, strict=True)]
+        self.x[YAW] = wrap(self.x[YAW])
+        self.x[BIAS] = min(max(self.x[BIAS], -self._max_bias), self._max_bias)
 
 
 def wrap(angle: float) -> float:
     """`angle` [rad] in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def _mirrored(lower: Iterable[list[float]]) -> list[list[float]]:
+    """The symmetric matrix of a lower triangle, row by row."""
+    (a0,), (b0, b1), (c0, c1, c2), (d0, d1, d2, d3), (e0, e1, e2, e3, e4), (f0, f1, f2, f3, f4, f5) = lower
+    return [
+        [a0, b0, c0, d0, e0, f0],
+        [b0, b1, c1, d1, e1, f1],
+        [c0, c1, c2, d2, e2, f2],
+        [d0, d1, d2, d3, e3, f3],
+        [e0, e1, e2, e3, e4, f4],
+        [f0, f1, f2, f3, f4, f5],
+    ]
