@@ -61,7 +61,7 @@ class PlanarFilter:
         density = self._velocity_density
         place, half, walk = density * dt**3 / 3.0, 0.5 * density * dt**2, density * dt
 
-        # F P F' + Q, where the Jacobian F adds to x: -dy yaw + c vx - s vy, to y: dx yaw + s vx + c vy, to yaw: -dt bias
+        # F P F' + Q; F adds to x: -dy yaw + c vx - s vy, to y: dx yaw + s vx + c vy, to yaw: -dt bias
         on_x, on_y, on_yaw, on_vx, on_vy, on_bias = self.P
         of_yaw = zip(on_yaw, on_vx, on_vy, on_x, on_y, strict=True)
         moved = [(a - dy * h + c * v - s * w, b + dx * h + s * v + c * w) for h, v, w, a, b in of_yaw]
