@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Every value can be set as key.path=value, for example skill.total_steps=50000; "
         "`hiernav config` lists them all.",
     )
-    train.add_argument("--config", metavar="FILE", help="YAML with what differs from the defaults")
+    _add_configuration(train, "YAML with what differs from the defaults")
     train.add_argument("--resume", metavar="RUN", help="go on with this run folder from its last checkpoints")
     train.add_argument("--stage", choices=("planner", "skill", "all"), default="all", help="what to train (all)")
     train.add_argument(
@@ -90,7 +90,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.add_argument("--workers", metavar="N", help="processes that simulate, for multi and ray (skill.workers)")
     train.add_argument("--ray-address", metavar="ADDRESS", help="Ray cluster to join (skill.ray_address)")
-    train.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
     train.set_defaults(run=_train)
 
     evaluate = commands.add_parser(
@@ -179,13 +178,12 @@ def _parser() -> argparse.ArgumentParser:
         "All else is taken from the configuration: robot, planning radius, margin, preset, seed, threads.",
     )
     dataset.add_argument("--out", metavar="DIR", required=True, help="where the data set is, or is to be")
-    dataset.add_argument("--config", metavar="FILE", help="YAML with what differs from the defaults")
+    _add_configuration(dataset, "YAML with what differs from the defaults")
     dataset.add_argument("--samples", metavar="N", help="how many (planner.samples)")
     dataset.add_argument("--world", action="append", metavar="WORLD", help="repeat for a mix (planner.worlds)")
     dataset.add_argument("--sheet", metavar="FILE", help="write a PNG of some samples")
     dataset.add_argument("--check", action="store_true", help="make nothing: read all of it and check it")
     dataset.add_argument("--json", action="store_true", help="print what was made as JSON")
-    dataset.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
     dataset.set_defaults(run=_dataset)
 
     world = commands.add_parser(
@@ -203,10 +201,15 @@ def _parser() -> argparse.ArgumentParser:
         help="list every setting",
         description="List every setting with its default, or print a resolved configuration as YAML.",
     )
-    config.add_argument("--config", metavar="FILE", help="resolve this file instead of listing the settings")
-    config.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
+    _add_configuration(config, "resolve this file instead of listing the settings")
     config.set_defaults(run=_config)
     return parser
+
+
+def _add_configuration(parser: argparse.ArgumentParser, file_help: str) -> None:
+    """What a command takes that runs on a configuration: a file, and values that override it."""
+    parser.add_argument("--config", metavar="FILE", help=file_help)
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="values that override the file's")
 
 
 def _train(arguments: argparse.Namespace) -> int:
