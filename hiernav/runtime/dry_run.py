@@ -15,6 +15,7 @@ from rich.table import Table
 
 from hiernav.nav.bundle import Bundle
 from hiernav.runtime.clock import MonotonicClock
+from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.policy import check_golden, load_policies
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
@@ -29,9 +30,10 @@ PERIOD = 0.005
 def report(
     open_bundle: Callable[[], Bundle], make_robot: Callable[[], ProcessRobot], settings: Settings
 ) -> dict[str, Any]:
-    """Findings on bundle, robot and host, in JSON's own types; what failed has an "error"."""
+    """Findings on bundle, robot, estimator and host, in JSON's own types; what failed has an "error"."""
     found: dict[str, Any] = {"bundle": _attempt(lambda: _check_bundle(open_bundle()))}
     found["robot"] = _attempt(lambda: _check_robot(make_robot()))
+    found["estimator"] = _attempt(_check_filter)
     found["host"] = _check_host(settings)
     return found
 
@@ -79,6 +81,13 @@ def _check_robot(robot: ProcessRobot) -> dict[str, Any]:
         "not finite": f"missing: {', '.join(broken)}" if broken else "none",
         **{f"adapter {name}": text for name, text in robot.realtime.items()},
     }
+
+
+def _check_filter() -> dict[str, Any]:
+    deviation = filter_deviation()
+    if not deviation < TOLERANCE:
+        raise RuntimeError(f"the filter deviates from filterpy's by {deviation:.2g}, the limit is {TOLERANCE:g}")
+    return {"filter beside filterpy's": f"off by {deviation:.1g} at most"}
 
 
 def _check_host(settings: Settings) -> dict[str, Any]:

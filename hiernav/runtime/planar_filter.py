@@ -1,9 +1,9 @@
 """Extended Kalman filter of a robot's planar motion, gated before every update.
 
 Six numbers and their covariance are too few for numpy, whose calls take longer to begin than these sums take in plain
-Python; and plain sums give the same on every processor. The tests hold the filter against filterpy's
-`ExtendedKalmanFilter`, none of whose methods would be called here, and whose import took as long as all the rest of a
-control process's start.
+Python; and plain sums give the same on every processor. Importing filterpy took as long as all the rest of a control
+process's start, so its `ExtendedKalmanFilter` is what this filter is held against instead: in the tests, and on the
+robot's own machine by a dry run (`filter_check`).
 """
 
 from __future__ import annotations

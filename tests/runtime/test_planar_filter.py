@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 
+from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter
 from hiernav.runtime.tilt import TiltFilter, level_axes
 
@@ -25,6 +26,21 @@ def general_filter(filter_: PlanarFilter) -> ExtendedKalmanFilter:
     general = ExtendedKalmanFilter(dim_x=6, dim_z=2)
     general.x, general.P = np.array(filter_.x), np.array(filter_.P)
     return general
+
+
+def test_over_a_whole_drive_it_stays_with_the_general_filter():
+    assert filter_deviation(steps=500, seed=1) < 1e-10
+
+
+def test_a_filter_that_forgets_a_correlation_is_found_out(monkeypatch):
+    predict = PlanarFilter.predict_motion
+
+    def forgetful(self, dt, yaw_rate, yaw_sigma):
+        predict(self, dt, yaw_rate, yaw_sigma)
+        self.P[0][3] = self.P[3][0] = 0.0
+
+    monkeypatch.setattr(PlanarFilter, "predict_motion", forgetful)
+    assert filter_deviation() > TOLERANCE
 
 
 @pytest.mark.parametrize("seed", range(5))
