@@ -1,7 +1,7 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
-Exit codes: 0 done; 1 training diverged or lost its workers, or a replay differs; 2 bad input, with one line that says
-what to do; 130 interrupted.
+Exit codes: 0 done; 1 training diverged or lost its workers, a replay differs, or a result is damaged; 2 bad input, with
+one line that says what to do; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -185,6 +185,16 @@ def _parser() -> argparse.ArgumentParser:
     dataset.add_argument("--check", action="store_true", help="make nothing: read all of it and check it")
     dataset.add_argument("--json", action="store_true", help="print what was made as JSON")
     dataset.set_defaults(run=_dataset)
+
+    report = commands.add_parser(
+        "report",
+        help="make one page of all results",
+        description="Turn the results of tools/reproduce.py into one HTML file that needs no network: the paper's "
+        "tables beside ours, curves, films, and what fell short. Exit code 1 if a result file is damaged.",
+    )
+    report.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="(results)")
+    report.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="(report.html)")
+    report.set_defaults(run=_report)
 
     world = commands.add_parser(
         "world", help="draw a world", description="Sample a world from a seed and draw it, or print it as JSON."
@@ -448,6 +458,18 @@ def _dataset(arguments: argparse.Namespace) -> int:
         draw_sheet(read_dataset(folder, min(manifest.samples, 2000)), manifest.settings, arguments.sheet)
         print(f"wrote {arguments.sheet}", file=sys.stderr if arguments.json else sys.stdout)
     return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from hiernav.report.page import write_report
+
+    book = write_report(arguments.results, arguments.out)
+    failed = sum(result.state == "failed" for result in book.results)
+    size = arguments.out.stat().st_size / 1e6
+    print(f"{arguments.out}: {size:.2f} MB; {len(book.results)} results, {failed} of them failed cells")
+    for line in book.damaged:
+        print(f"damaged: {line}", file=sys.stderr)
+    return FAILED if book.damaged else 0
 
 
 def _world(arguments: argparse.Namespace) -> int:

@@ -34,7 +34,7 @@ ALLOWED = {
     "draw": {"nav", "sim"},
     "film": {"nav", "sim", "evaluate", "draw"},
     "reproduce": {"nav", "sim", "planner", "evaluate", "finetune", "training", "film", "config", "run"},
-    "report": {"nav", "sim", "evaluate", "config", "draw", "reproduce"},
+    "report": {"evaluate", "reproduce", "run"},
     "cli": {
         "nav",
         "sim",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ from hiernav.reproduce.experiments import EXPERIMENTS
 from hiernav.reproduce.queue import Entry, Estimates, Tally, Watcher, duration
 from hiernav.reproduce.results import Result
 
+_LINE_SECONDS = 60.0
+"""Between two lines where there is no terminal for bars."""
 _COLORS = {"done": "green", "failed": "red", "damaged": "red", "changed": "yellow", "open": "default"}
 
 
@@ -69,6 +72,7 @@ class Bars(Watcher):
         self._whole = self.bars.add_task("queue", total=1.0, note="")
         self._one = self.bars.add_task("", total=1.0, note="", visible=False)
         self._spent = 0.0
+        self._printed = time.monotonic()
 
     def began(self, cell: Cell, seconds: float) -> None:
         self._number += 1
@@ -81,6 +85,9 @@ class Bars(Watcher):
         self._share = min(max(share, 0.0), 1.0)
         self.bars.update(self._one, completed=self._share, note=what)
         self._show(cell)
+        if not self.bars.console.is_terminal and time.monotonic() - self._printed > _LINE_SECONDS:
+            whole = self.bars.tasks[self._whole].fields["note"]
+            self._print(f"    {100 * self._share:.0f} % of {cell.id}: {what}; {whole}")
 
     def ended(self, cell: Cell, result: Result | None, why: str | None) -> None:
         if cell in self._waiting:
@@ -106,6 +113,7 @@ class Bars(Watcher):
         )  # fmt: skip
 
     def _print(self, text: str) -> None:
+        self._printed = time.monotonic()
         self.bars.console.print(escape(text), highlight=False, soft_wrap=True)
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from hiernav.config import TrainConfig, dump_config, load_config
+from hiernav.config import TrainConfig, load_config
 from hiernav.film.film import film_name
 from hiernav.reproduce.cells import Cell
 from hiernav.sim.layout import parse_world
@@ -242,7 +243,8 @@ class _Maker:
 
     def _config(self, seed: int, overrides: list[str]) -> str:
         file = self.root / "configs" / f"{self.robot}.yaml"
-        return dump_config(load_config(file, [*overrides, *self.size.training, f"seed={seed}", "run_dir=null"]))
+        config = _load(file, file.stat().st_mtime_ns, (*overrides, *self.size.training, "run_dir=null"))
+        return msgspec.json.encode(msgspec.structs.replace(config, seed=seed)).decode()
 
     def _train(
         self, experiment: str, variant: str, seed: int, overrides: list[str], needs: tuple[str, ...] = ()
@@ -282,6 +284,12 @@ class _Maker:
             needs=needs,
             seconds=self.size.share * (EVALUATION_SECONDS[self.robot] + fine_tuned * FINE_TUNING_SECONDS),
         )  # fmt: skip
+
+
+@cache
+def _load(file: Path, changed: int, overrides: tuple[str, ...]) -> TrainConfig:
+    """A configuration as the file was at the time `changed`."""
+    return load_config(file, list(overrides))
 
 
 def differences(config: TrainConfig) -> dict[str, Any]:

@@ -65,6 +65,42 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return f"{self.experiment}/{self.cell}"
 
 
+class Drive(msgspec.Struct, frozen=True, kw_only=True):
+    """What a drive through a world's episodes came to, as far as it is needed again."""
+
+    episodes: int
+    reach_rate: float
+    reach_ci95: tuple[float, float]
+    steps_mean: float
+    steps_half95: float | None
+    """Half the width of the 95 % interval, as in the other names that end so."""
+    collisions_mean: float
+    collisions_half95: float | None
+    collision_free_rate: float
+    spl_mean: float | None
+    spl_half95: float | None
+    return_mean: float
+    steps_between_plans: float | None
+    endings: dict[str, int]
+    """How often episodes ended by each of "goal", "left_field", "timeout", "physics"."""
+    proposals: int = 0
+    repairs: int = 0
+
+
+def drive_of(result: Result, protocol: str = "strict") -> Drive | None:
+    """What a result says under a protocol, None if it was not driven.
+
+    Raises:
+        ResultError: numbers are missing, or are none.
+    """
+    if protocol not in result.metrics:
+        return None
+    try:
+        return msgspec.convert(result.metrics[protocol], Drive)
+    except msgspec.ValidationError as error:
+        raise ResultError(f"result {result.id}: metrics.{protocol}: {error}") from None
+
+
 def result_path(folder: Path, cell: str) -> Path:
     """File of a cell ("experiment/name")."""
     return folder / f"{cell}.json"
@@ -100,6 +136,11 @@ def read_result(folder: Path, cell: str) -> Result | None:
         raise ResultError(f"{path}: holds the result of {result.id}")
     if (result.state == "failed") != (result.error is not None):
         raise ResultError(f"{path}: state {result.state!r} with error {result.error!r}")
+    for protocol in ("strict", "paper"):
+        try:
+            drive_of(result, protocol)
+        except ResultError as error:
+            raise ResultError(f"{path}: {error}") from None
     return result
 
 

@@ -18,6 +18,7 @@ from hiernav.reproduce.results import ResultError, read_result, read_results, re
 from hiernav.reproduce.work import Outcome
 
 ROOT = Path(__file__).parents[2]
+CELLS = catalogue(ROOT)
 
 
 @pytest.fixture
@@ -28,6 +29,13 @@ def places(tmp_path: Path) -> Places:
 def cell(name: str, seconds: float = 10.0, **changes) -> Cell:
     given = {"experiment": "astar", "kind": "evaluate", "robot": "point", "variant": "astar", "world": "gremlin"}
     return Cell(name=name, seconds=seconds, **{**given, "settings": {"episodes": 5}, **changes})
+
+
+DRIVE = {
+    "episodes": 8, "reach_rate": 0.75, "reach_ci95": [0.41, 0.93], "steps_mean": 50.0, "steps_half95": 4.0,
+    "collisions_mean": 0.5, "collisions_half95": 0.1, "collision_free_rate": 0.5, "spl_mean": 0.9, "spl_half95": 0.02,
+    "return_mean": 1.0, "steps_between_plans": 8.0, "endings": {"goal": 6, "timeout": 2},
+}  # fmt: skip
 
 
 class Work:
@@ -41,7 +49,7 @@ class Work:
         report(0.5, "half of it")
         if cell.name in self.errors:
             raise self.errors[cell.name]
-        return Outcome({"strict": {"reach_rate": 0.75}}, {"bundle": "b"}, cell.settings)
+        return Outcome({"strict": DRIVE}, {"bundle": "b"}, cell.settings)
 
 
 def test_what_was_run_is_not_run_again(places):
@@ -51,7 +59,7 @@ def test_what_was_run_is_not_run_again(places):
     assert Queue(cells, places, work).run().done == []
     assert work.calls == ["a", "b"]
     result = read_result(places.results, "astar/a")
-    assert result.metrics == {"strict": {"reach_rate": 0.75}} and result.state == "done"
+    assert result.metrics == {"strict": DRIVE} and result.state == "done"
     assert result.command == "python tools/reproduce.py --only astar/a"
     assert result.machine.cores >= 1 and result.machine.cpu and "mujoco" in result.machine.versions
 
@@ -147,6 +155,8 @@ def test_two_queues_do_not_work_on_the_same_cell(places):
         (lambda text: text.replace('"metrics"', '"metrix"'), "metrix"),
         (lambda text: text.replace('"seconds": ', '"seconds": "soon", "x": '), "seconds"),
         (lambda text: text.replace('"state": "done"', '"state": "failed"'), "state 'failed' with error None"),
+        (lambda text: text.replace('"steps_mean": 50.0', '"steps_mean": "few"'), "metrics.strict"),
+        (lambda text: text.replace('"endings"', '"ends"'), "metrics.strict"),
         (lambda text: text.replace('"cell": "a"', '"cell": "b"'), "holds the result of astar/b"),
     ],
 )
@@ -203,14 +213,14 @@ def test_an_ablation_differs_from_ours_and_its_folder_too():
 
 
 def test_what_needs_no_training_can_be_had_alone():
-    cells = select(catalogue(ROOT), training=False)
+    cells = select(CELLS, training=False)
     assert {each.kind for each in cells} == {"evaluate", "film"}
     assert {each.experiment for each in cells} == {"table3", "astar", "replanning", "ablations", "films"}
     assert all(each.bundle for each in cells)
 
 
 def test_a_choice_brings_what_it_needs():
-    cells = catalogue(ROOT)
+    cells = CELLS
     chosen = select(cells, ["table3/doggo-finetuned-0-gremlin"])
     assert [each.id for each in chosen] == [
         "sample_efficiency/doggo-ours-0", "planners/doggo-0", "table3/doggo-finetuned-0-gremlin"

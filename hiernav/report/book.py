@@ -1,0 +1,133 @@
+"""The results as tables and figures ask for them: groups of seeds, and means with 95 % intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hiernav.evaluate import wilson_interval
+from hiernav.reproduce.cells import Places, cell_key
+from hiernav.reproduce.experiments import catalogue
+from hiernav.reproduce.results import Drive, Result, drive_of, read_results
+
+_HALF_WIDTHS = {"steps_mean": "steps_half95", "collisions_mean": "collisions_half95", "spl_mean": "spl_half95"}
+
+_RANGES = {
+    **dict.fromkeys(("reach_rate", "collision_free_rate", "spl_mean"), (0.0, 1.0)),
+    **dict.fromkeys(("steps_mean", "collisions_mean", "steps_between_plans"), (0.0, math.inf)),
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean and the ends of its 95 % interval, which are NaN where there is none."""
+
+    mean: float
+    low: float = math.nan
+    high: float = math.nan
+    count: int = 1
+    """Trainings it was taken over."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Results that differ in their seed alone."""
+
+    done: tuple[Result, ...] = ()
+    failed: tuple[Result, ...] = ()
+
+    def estimate(self, name: str, protocol: str = "strict") -> Estimate | None:
+        """Of a number of `Drive`: over seeds where there are several, over episodes where there is one; None: not run.
+
+        Intervals: Student's t over seeds; over episodes Wilson for rates, normal for means.
+        """
+        drives = [drive for result in self.done if (drive := drive_of(result, protocol)) is not None]
+        values = [float(value) for drive in drives if (value := getattr(drive, name)) is not None]
+        if len(values) == 1:
+            return _of_episodes(next(d for d in drives if getattr(d, name) is not None), name)
+        return of_seeds(values, *_RANGES.get(name, (-math.inf, math.inf)))
+
+
+def of_seeds(values: Sequence[float], least: float = -math.inf, most: float = math.inf) -> Estimate | None:
+    """Mean over trainings with Student's 95 % interval, cut to what is possible; None of none."""
+    if not values:
+        return None
+    mean = float(np.mean(values))
+    if len(values) == 1:
+        return Estimate(mean)
+    from scipy.stats import t
+
+    half = float(t.ppf(0.975, len(values) - 1)) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return Estimate(mean, max(mean - half, least), min(mean + half, most), len(values))
+
+
+@dataclass
+class Book:
+    """All results of a folder."""
+
+    folder: Path
+    results: list[Result]
+    damaged: list[str]
+    """A line for each file that cannot be used."""
+    changed: set[str] = field(default_factory=set)
+    """Results whose settings or bundle are no longer those of the repository."""
+    planned: dict[str, int] = field(default_factory=dict)
+    """Experiment -> cells; empty away from the repository."""
+
+    @classmethod
+    def open(cls, folder: Path) -> Book:
+        """Read a folder. Beside the repository's configurations, it also knows what is missing and what has changed."""
+        if not folder.is_dir():
+            raise ValueError(f"{folder} is no folder of results: make them with tools/reproduce.py")
+        results, damaged = read_results(folder)
+        book, root = cls(folder, results, damaged), folder.resolve().parent
+        if (root / "configs").is_dir() and (root / "deploy").is_dir():
+            places = Places(root, folder, root / "runs")
+            # more seeds than usual, so that all that were trained are known
+            most = max((result.seed + 1 for result in results if result.seed is not None), default=1)
+            keys = {cell.id: cell_key(cell, places) for cell in catalogue(root, seeds=max(5, most))}
+            book.changed = {r.id for r in results if keys.get(r.id) != r.key}
+            for cell in catalogue(root):
+                book.planned[cell.experiment] = book.planned.get(cell.experiment, 0) + 1
+        return book
+
+    def group(self, experiment: str, variant: str, robot: str | None = None, world: str | None = None) -> Group:
+        """Results of a variant, by seed."""
+        found = [
+            result
+            for result in self.results
+            if (result.experiment, result.variant) == (experiment, variant)
+            and robot in (None, result.robot)
+            and world in (None, result.world)
+        ]
+        found.sort(key=lambda result: -1 if result.seed is None else result.seed)
+        return Group(
+            tuple(result for result in found if result.state == "done"),
+            tuple(result for result in found if result.state == "failed"),
+        )
+
+    def variants(self, experiment: str) -> list[str]:
+        """Variants that there are results of, in the order of their names."""
+        return sorted({result.variant for result in self.results if result.experiment == experiment})
+
+
+def curve(result: Result, name: str, stage: str = "evaluation") -> tuple[np.ndarray, np.ndarray]:
+    """Steps and values of what a training logged: (T,) and (T,), NaN where a value is not known."""
+    points: list[dict[str, Any]] = list(result.curves.get(stage, []))
+    values = [math.nan if point.get(name) is None else point[name] for point in points]
+    return np.array([point["step"] for point in points], dtype=float), np.array(values, dtype=float)
+
+
+def _of_episodes(drive: Drive, name: str) -> Estimate:
+    value = float(getattr(drive, name))
+    if name == "reach_rate":
+        return Estimate(value, *drive.reach_ci95)
+    if name == "collision_free_rate":
+        return Estimate(value, *wilson_interval(round(value * drive.episodes), drive.episodes))
+    half = getattr(drive, _HALF_WIDTHS[name]) if name in _HALF_WIDTHS else None
+    return Estimate(value) if half is None else Estimate(value, value - half, value + half)

@@ -1,0 +1,175 @@
+"""Text that says where we stand against the paper and against our own targets; every number in it is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hiernav.report import paper
+from hiernav.report.book import Book, Group, curve
+from hiernav.reproduce.experiments import ROBOTS, WORLDS
+from hiernav.reproduce.results import Result, drive_of
+
+STRICT_TARGET = 0.97
+SAMPLE_TARGET = (0.9, 500_000)
+"""Reach rate, and the environment steps in which the doggo has to get there."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One target, and whether it is met; None while there is nothing to tell it by."""
+
+    target: str
+    met: bool | None
+    text: str
+
+
+def findings(book: Book) -> list[Finding]:
+    """All targets, in the order of the page."""
+    return [
+        _paper_table3(book),
+        *(_strict(book, robot) for robot in ROBOTS),
+        _doggo_steps(book),
+        *(_above_baseline(book, robot) for robot in ROBOTS),
+        _table2(book),
+    ]
+
+
+def shortfalls(book: Book, robot: str) -> list[str]:
+    """A sentence for each world in which the shipped robot misses the strict target: how, and what A* says of why."""
+    sentences = []
+    for world in WORLDS:
+        for result in book.group("table3", "shipped", robot, world).done:
+            drive = drive_of(result)
+            if drive is None or drive.reach_rate >= STRICT_TARGET:
+                continue
+            failures = drive.episodes - drive.endings.get("goal", 0)
+            kinds = sorted(((n, kind) for kind, n in drive.endings.items() if kind != "goal"), reverse=True)
+            how = ", ".join(f"{n} by {_ENDINGS.get(kind, kind)}" for n, kind in kinds)
+            text = f"{world}: {failures} of {drive.episodes} episodes fail, {how}."
+            sentences.append(f"{text} {_blame(book, robot, world, drive.reach_ci95)}".strip())
+    return sentences
+
+
+_ENDINGS = {"timeout": "reaching the cap on steps", "left_field": "leaving the field", "physics": "diverging physics"}
+
+
+def _blame(book: Book, robot: str, world: str, interval: tuple[float, float]) -> str:
+    other = book.group("astar", "astar", robot, world).estimate("reach_rate")
+    if other is None:
+        return "Whether the plans or the skill are the cause is not known: A* as planner was not run yet."
+    low, high = interval
+    if other.low > high:
+        return f"With A* plans it reaches {other.mean:.3f}: part of the cause is the learned planner."
+    if other.high < low:
+        return f"With A* plans it reaches no more than {other.mean:.3f}: the learned planner is not the cause."
+    return f"With A* plans it reaches {other.mean:.3f}, no clear difference: that plans are learned is not the cause."
+
+
+def _paper_table3(book: Book) -> Finding:
+    target = "Every cell of Table III at or above the paper's best, under its own protocol (doggo)"
+    missed, met, missing = [], 0, []
+    for world in paper.TABLE3:
+        best_reach, best_steps = paper.best_of_table3(world)
+        groups = [book.group("table3", v, paper.TABLE3_ROBOT, world) for v in ("shipped", "ours", "shipped-finetuned",
+                                                                               "finetuned")]  # fmt: skip
+        pairs = [(g.estimate("reach_rate", "paper"), g.estimate("steps_mean", "paper")) for g in groups]
+        known = [(reach.mean, steps.mean) for reach, steps in pairs if reach is not None and steps is not None]
+        if not known:
+            missing.append(world)
+            continue
+        reach, steps = max(known, key=lambda pair: (pair[0], -pair[1]))
+        short = []
+        if reach < best_reach:
+            short.append(f"reach rate {reach:.3f} against {best_reach:.2f}")
+        if steps > best_steps:
+            short.append(f"{steps:.1f} steps against {best_steps:.1f}")
+        met += not short
+        if short:
+            missed.append(f"{world} ({', '.join(short)})")
+    return _verdict(target, met, missed, missing, "worlds")
+
+
+def _strict(book: Book, robot: str) -> Finding:
+    target = (
+        f"Reach rate of at least {STRICT_TARGET} in every world under the strict protocol ({robot}, shipped bundle)"
+    )
+    missed, met, missing = [], 0, []
+    for world in WORLDS:
+        estimate = book.group("table3", "shipped", robot, world).estimate("reach_rate")
+        if estimate is None:
+            missing.append(world)
+        elif estimate.mean >= STRICT_TARGET:
+            met += 1
+        else:
+            missed.append(f"{world} ({estimate.mean:.3f})")
+    return _verdict(target, met, missed, missing, "worlds")
+
+
+def _doggo_steps(book: Book) -> Finding:
+    rate, limit = SAMPLE_TARGET
+    target = f"The doggo reaches {rate} within {limit:,} environment steps (the paper trained {paper.TRAINING_STEPS:,})"
+    group = book.group("sample_efficiency", "ours", "doggo")
+    missed, met = [f"seed {result.seed} (failed)" for result in group.failed], 0
+    for result in group.done:
+        first = steps_to(result, rate)
+        if first is not None and first <= limit:
+            met += 1
+        else:
+            missed.append(f"seed {result.seed} ({'never' if first is None else f'{first:,.0f} steps'})")
+    return _verdict(target, met, missed, [] if group.done or group.failed else ["no seed"], "seeds")
+
+
+def _above_baseline(book: Book, robot: str) -> Finding:
+    target = f"Ours above the baseline for every seed ({robot}; reach rate, then return by the baseline's reward)"
+    ours, theirs = (_by_seed(book.group("sample_efficiency", v, robot)) for v in ("ours", "baseline"))
+    missed, met = [], 0
+    for seed in sorted(ours.keys() & theirs.keys()):
+        a, b = drive_of(ours[seed]), drive_of(theirs[seed])
+        assert a is not None and b is not None, "a training ends with a drive"
+        if (a.reach_rate, a.return_mean) > (b.reach_rate, b.return_mean):
+            met += 1
+        else:
+            missed.append(f"seed {seed} ({a.reach_rate:.3f} against {b.reach_rate:.3f})")
+    return _verdict(target, met, missed, [] if met or missed else ["no pair of seeds"], "seeds")
+
+
+def _table2(book: Book) -> Finding:
+    target = "Fewer collisions of plans than in Table II, for every number of samples (our network)"
+    missed, met, missing = [], 0, []
+    for samples, printed in paper.TABLE2.items():
+        found = book.group("table2", "default").done
+        values = [r.metrics["collisions_mean"] for r in found if r.metrics["samples"] == samples]
+        if not values:
+            missing.append(f"{samples:,}")
+        elif np.mean(values) <= printed:
+            met += 1
+        else:
+            missed.append(f"{samples:,} ({np.mean(values):.2f} against {printed:.2f})")
+    return _verdict(target, met, missed, missing, "sizes")
+
+
+def steps_to(result: Result, rate: float) -> float | None:
+    """Environment steps after which an evaluation first reached a rate, None if none did."""
+    steps, values = curve(result, "reach_rate")
+    reached = np.flatnonzero(values >= rate)
+    return float(steps[reached[0]]) if len(reached) else None
+
+
+def _by_seed(group: Group) -> dict[int, Result]:
+    return {result.seed: result for result in group.done if result.seed is not None}
+
+
+def _verdict(target: str, met: int, missed: Sequence[str], missing: Sequence[str], what: str) -> Finding:
+    total = met + len(missed) + len(missing)
+    parts = []
+    if missed:
+        parts.append(f"missed: {', '.join(missed)}")
+    if missing:
+        parts.append(f"not run yet: {', '.join(missing)}")
+    if met:
+        parts.insert(0, f"met for {met} of {total} {what}")
+    state = False if missed else None if missing else True
+    return Finding(target, state, "; ".join(parts))

@@ -1,0 +1,199 @@
+"""The tables of the page: the paper's numbers beside ours, and "not run yet" where there are none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from hiernav.report import paper
+from hiernav.report.book import Book, Estimate, Group, of_seeds
+from hiernav.reproduce.experiments import DRIVING, PERIODS, ROBOTS, TRAINING, WORLDS
+
+NOT_RUN = '<span class="none">not run yet</span>'
+_DIGITS = {"reach_rate": 3, "steps_mean": 1, "collisions_mean": 2, "collision_free_rate": 3, "spl_mean": 3}
+_DIGITS["steps_between_plans"] = 1
+_HEADS = {
+    "reach_rate": "reach rate", "steps_mean": "steps", "collisions_mean": "collisions",
+    "collision_free_rate": "collision-free", "spl_mean": "SPL", "steps_between_plans": "steps between plans",
+}  # fmt: skip
+VARIANTS = {
+    "baseline": "baseline",
+    "shipped": "ours, shipped bundle",
+    "ours": "ours, trained seeds",
+    "shipped-finetuned": "shipped, planner fine-tuned",
+    "finetuned": "trained seeds, planner fine-tuned",
+}
+WHAT = {
+    "no-repair": "plans are not verified or repaired", "no-recovery": "a robot that stands still gets no way out",
+    "no-invalid-rule": "plans that meet the map are kept", "paper-reward": "the paper's reward",
+    "one-world": "trained in pillar(2,2,10) alone, as in the paper", "no-phase-in": "all worlds from the start",
+    "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
+    "no-alpha-floor": "no floor of the temperature", "whole-episodes": "training episodes run to the cap",
+    "go-on-after-fall": "training goes on after a fall", "no-clock": "no gait clock",
+    "layer-norm": "with layer normalisation in the critics", "learned-plans": "trained with the network's plans",
+}  # fmt: skip
+"""Ablation -> what differs."""
+
+
+def table3(book: Book, robot: str, name: str) -> str:
+    """The paper's Table III and ours, under the paper's protocol."""
+    columns = [
+        ("baseline", "the paper", None), ("baseline", "ours", "baseline"), ("ours", "the paper", None),
+        ("ours", "shipped", "shipped"), ("ours", "trained", "ours"), ("finetuned", "the paper", None),
+        ("finetuned", "shipped", "shipped-finetuned"), ("finetuned", "trained", "finetuned"),
+    ]  # fmt: skip
+    if robot != paper.TABLE3_ROBOT:
+        columns = [column for column in columns if column[2] is not None]
+    rows = []
+    for world in WORLDS:
+        row = [escape(world)]
+        for theirs, _, ours in columns:
+            if ours is None:
+                printed = paper.table3(robot, world, theirs)
+                row.append("–" if printed is None else _printed(printed, name))
+            else:
+                bar = None if theirs == "baseline" else _bar(robot, world, name)
+                row.append(cell(book.group("table3", ours, robot, world), name, "paper", bar))
+        rows.append(row)
+    groups = {"baseline": "Baseline", "ours": "Ours", "finetuned": "Fine-tuned"}
+    return table([f"{groups[theirs]}<br><small>{whose}</small>" for theirs, whose, _ in columns], rows, "world")
+
+
+def strict(book: Book, robot: str) -> str:
+    """Everything that was driven in the six worlds, under the strict protocol."""
+    names = ("reach_rate", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean")
+    rows = []
+    for world in WORLDS:
+        for experiment, variant, label in (
+            *(("table3", variant, label) for variant, label in VARIANTS.items()),
+            ("astar", "astar", "A* as planner"),
+        ):
+            group = book.group(experiment, variant, robot, world)
+            if group.done or group.failed or variant in ("baseline", "shipped", "ours", "finetuned", "astar"):
+                rows.append([f"{escape(world)}<br><small>{label}</small>", *(cell(group, name) for name in names)])
+    return table([_HEADS[name] for name in names], rows, "world, policies")
+
+
+def table2(book: Book) -> str:
+    """Table II and ours."""
+    rows = []
+    for samples, printed in paper.TABLE2.items():
+        row = [f"{samples:,}", f'<span class="theirs">{printed:.2f}</span>']
+        for preset in ("paper", "default"):
+            group = book.group("table2", preset)
+            values = [r.metrics["collisions_mean"] for r in group.done if r.metrics["samples"] == samples]
+            failed = [r for r in group.failed if r.settings.get("samples") == samples]
+            row.append(_shown(of_seeds(values, 0.0), "collisions_mean", len(failed), printed, fewer=True))
+        rows.append(row)
+    return table(["the paper", "its network, ours", "our network"], rows, "samples")
+
+
+def replanning(book: Book) -> str:
+    """Fixed periods against the rule, of the shipped bundles."""
+    names = ("steps_between_plans", "reach_rate", "steps_mean", "collisions_mean")
+    rows = []
+    for robot in ROBOTS:
+        for world in ("pillar(2,2,10)", "gremlin", "four-room"):
+            kinds = [("table3", "shipped", "the rule")]
+            kinds += [("replanning", f"period-{period}", f"every {period} steps") for period in PERIODS]
+            for experiment, variant, label in kinds:
+                group = book.group(experiment, variant, robot, world)
+                first = f"{robot}, {escape(world)}<br><small>{label}</small>"
+                rows.append([first, *(cell(group, name) for name in names)])
+    return table([_HEADS[name] for name in names], rows, "robot, world")
+
+
+def trained_periods(book: Book) -> str:
+    """Trainings with fixed periods, driven with A* plans."""
+    kinds = [(robot, f"trained-period-{period}", f"every {period} steps") for robot in ROBOTS for period in PERIODS]
+    return _trainings(book, "replanning", kinds)
+
+
+def driving_ablations(book: Book) -> str:
+    """Departures that were switched off in driving alone."""
+    names = ("reach_rate", "steps_mean", "collisions_mean", "collision_free_rate")
+    rows = []
+    for robot in ROBOTS:
+        for world in ("pillar(2,2,10)", "gremlin", "four-room"):
+            for experiment, variant, label in (
+                ("table3", "shipped", "as shipped"),
+                *(("ablations", name, WHAT[name]) for name in DRIVING),
+            ):
+                group = book.group(experiment, variant, robot, world)
+                first = f"{robot}, {escape(world)}<br><small>{label}</small>"
+                rows.append([first, *(cell(group, name) for name in names)])
+    return table([_HEADS[name] for name in names], rows, "robot, world")
+
+
+def trained_ablations(book: Book) -> str:
+    """Departures that were trained without."""
+    kinds = [(robot, name, WHAT[name]) for robot in ROBOTS for name in TRAINING]
+    return _trainings(book, "ablations", kinds)
+
+
+def sample_efficiency(book: Book) -> str:
+    """Ends of the trainings, driven with A* plans; returns of both by the baseline's reward."""
+    kinds = [(robot, variant, variant) for robot in ROBOTS for variant in ("ours", "baseline")]
+    return _trainings(book, "sample_efficiency", kinds)
+
+
+def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]]) -> str:
+    names = ("reach_rate", "steps_mean", "collisions_mean")
+    rows: list[list[str]] = []
+    for robot, variant, label in kinds:
+        group = book.group(experiment, variant, robot)
+        if experiment != "sample_efficiency":
+            ours = book.group("sample_efficiency", "ours", robot)
+            if not any(row[0] == f"{robot}<br><small>ours</small>" for row in rows):
+                rows.append([f"{robot}<br><small>ours</small>", *(cell(ours, n) for n in (*names, "return_mean"))])
+        rows.append([f"{robot}<br><small>{label}</small>", *(cell(group, n) for n in (*names, "return_mean"))])
+    return table([*(_HEADS[name] for name in names), "return"], rows, "robot, training")
+
+
+def cell(group: Group, name: str, protocol: str = "strict", bar: float | None = None) -> str:
+    """A number with its interval, failed seeds named; marked if there is a bar to reach."""
+    return _shown(group.estimate(name, protocol), name, len(group.failed), bar, fewer=name != "reach_rate")
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], first: str) -> str:
+    """HTML of a table that scrolls by itself on a narrow screen; cells are HTML."""
+    head = "".join(f"<th>{text}</th>" for text in (first, *heads))
+    body = "".join(
+        f"<tr><th scope=row>{row[0]}</th>" + "".join(f"<td>{text}</td>" for text in row[1:]) + "</tr>" for row in rows
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _shown(estimate: Estimate | None, name: str, failed: int, bar: float | None, fewer: bool) -> str:
+    parts = []
+    if estimate is not None:
+        mark = ""
+        if bar is not None:
+            met = estimate.mean <= bar if fewer else estimate.mean >= bar
+            mark = ' class="met"' if met else ' class="short"'
+        parts.append(f"<span{mark}>{_number(estimate.mean, name)}</span>")
+        if not math.isnan(estimate.low):
+            parts.append(f"<small>{_number(estimate.low, name)} – {_number(estimate.high, name)}</small>")
+        if estimate.count > 1:
+            parts.append(f"<small>{estimate.count} seeds</small>")
+    if failed:
+        parts.append(f'<span class="short">{failed} failed</span>')
+    return "<br>".join(parts) or NOT_RUN
+
+
+def _number(value: float, name: str) -> str:
+    return f"{value:.{_DIGITS.get(name, 2)}f}"
+
+
+def _printed(pair: tuple[float, float], name: str) -> str:
+    """With the digits that the paper prints."""
+    reach, steps = pair
+    return f'<span class="theirs">{f"{steps:.1f}" if name == "steps_mean" else f"{reach:.2f}"}</span>'
+
+
+def _bar(robot: str, world: str, name: str) -> float | None:
+    """The paper's best of a row of Table III."""
+    if robot != paper.TABLE3_ROBOT or world not in paper.TABLE3:
+        return None
+    return paper.best_of_table3(world)[name == "steps_mean"]

@@ -1,0 +1,234 @@
+"""Claims about the page: its numbers are those of the results, it hides nothing, and it loads nothing."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from pathlib import Path
+
+import made_up
+import msgspec
+import pytest
+
+from hiernav import cli
+from hiernav.film.film import film_name
+from hiernav.report import findings as told
+from hiernav.report import paper, tables
+from hiernav.report.book import Book, of_seeds
+from hiernav.report.page import FILM_LIMIT, render, write_report
+from hiernav.reproduce.cells import Places, cell_key
+from hiernav.reproduce.experiments import ROBOTS, WORLDS
+from hiernav.reproduce.results import read_result, result_path, write_result
+from hiernav.sim.layout import parse_world
+
+FAILED = "sample_efficiency/doggo-ours-1"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of every cell, one of which failed."""
+    folder = tmp_path_factory.mktemp("results") / "results"
+
+    def change(cell):
+        if cell.id == FAILED:
+            return made_up.result_of(
+                cell, state="failed", error="TrainingDiverged: weights <nan>", metrics={}, curves={}
+            )
+        return made_up.result_of(cell)
+
+    made_up.write_all(folder, change)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def book(results: Path) -> Book:
+    return Book.open(results)
+
+
+@pytest.fixture(scope="module")
+def page(book: Book) -> str:
+    return render(book)
+
+
+def text_of(page: str) -> str:
+    return html.unescape(re.sub(r"<[^>]+>", " ", page))
+
+
+def rows(table: str) -> dict[str, list[str]]:
+    """First cell of each row -> texts of the others."""
+    found = {}
+    for row in re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL)[1:]:
+        first, *others = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL)
+        found[text_of(first).strip()] = [" ".join(text_of(other).split()) for other in others]
+    return found
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_numbers_of_the_page_are_those_of_the_results(results, book, robot):
+    shown = rows(tables.table3(book, robot, "reach_rate"))
+    steps = rows(tables.table3(book, robot, "steps_mean"))
+    column = 3 if robot == "doggo" else 1  # of the shipped bundle; the trained seeds' is the next one
+    for world in WORLDS:
+        slug = film_name(parse_world(world))
+        shipped = read_result(results, f"table3/{robot}-shipped-{slug}").metrics["paper"]
+        low, high = shipped["reach_ci95"]
+        assert shown[world][column] == f"{shipped['reach_rate']:.3f} {low:.3f} – {high:.3f}"
+        assert steps[world][column].startswith(f"{shipped['steps_mean']:.1f} ")
+        seeds = range(3 if robot == "doggo" else 5)
+        values = [read_result(results, f"table3/{robot}-ours-{s}-{slug}").metrics["paper"]["reach_rate"] for s in seeds]
+        trained = shown[world][column + 1]
+        assert trained.startswith(f"{sum(values) / len(values):.3f} ") and trained.endswith(f"{len(values)} seeds")
+
+
+def test_the_papers_numbers_are_there_and_belong_where_they_stand(book, page):
+    reach, steps = (rows(tables.table3(book, "doggo", name)) for name in ("reach_rate", "steps_mean"))
+    assert [reach["gremlin"][k] for k in (0, 2, 5)] == ["0.67", "0.99", "1.00"]
+    assert [steps["pillar(4,4,40)"][k] for k in (0, 2, 5)] == ["273.7", "76.9", "94.1"]
+    assert reach["pillar(2,2,10)"][0] == "–"
+    for samples, collisions in paper.TABLE2.items():
+        assert rows(tables.table2(book))[f"{samples:,}"][0] == f"{collisions:.2f}"
+    everything = text_of(page)
+    for row in paper.TABLE3.values():
+        for rate, count in row:
+            assert f"{rate:.2f}" in everything and f"{count:.1f}" in everything
+
+
+def test_an_interval_over_seeds_is_students():
+    estimate = of_seeds([1.0, 2.0, 3.0])
+    assert (estimate.low, estimate.high) == pytest.approx(
+        (2.0 - 4.302653 / math.sqrt(3), 2.0 + 4.302653 / math.sqrt(3))
+    )
+    assert of_seeds([0.9, 1.0], 0.0, 1.0).high == 1.0
+    assert of_seeds([]) is None
+
+
+def test_a_failed_seed_is_shown_as_failed_and_its_error_is_text(page):
+    assert "Failed: doggo ours, seed 1." in page
+    assert f"{FAILED}: TrainingDiverged: weights &lt;nan&gt;" in page
+    book_row = next(row for row in re.findall(r"<tr>.*?</tr>", page, re.DOTALL) if "doggo<br><small>ours" in row)
+    assert "1 failed" in book_row
+
+
+def test_what_was_not_run_is_said_to_be_so(tmp_path):
+    (tmp_path / "results").mkdir()
+    page = render(Book.open(tmp_path / "results"))
+    assert page.count("not run yet") > 50
+    assert "<svg" not in page
+    for finding in told.findings(Book.open(tmp_path / "results")):
+        assert finding.met is None
+
+
+def test_the_page_loads_nothing(page):
+    assert not re.findall(r"<(?:script|link|iframe|object|embed)\b", page)
+    for loaded in re.findall(r"""(?:src|href|xlink:href|srcset|poster|data)\s*=\s*["']([^"']*)""", page):
+        assert loaded.startswith(("#", "data:")), loaded
+    for loaded in re.findall(r"url\(([^)]*)\)", page):
+        assert loaded.startswith("#"), loaded
+    assert "@import" not in page
+    assert '<meta name="viewport" content="width=device-width' in page and "prefers-color-scheme:dark" in page
+
+
+def test_references_inside_figures_are_to_what_is_there_once(page):
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'(?:xlink:href="#|href="#|url\(#)([^")]+)', page)) <= set(ids)
+
+
+def test_every_figure_and_table_has_its_command(page):
+    for experiment in ("table3", "table3 astar", "table2", "sample_efficiency", "replanning", "ablations", "films"):
+        assert f"<code>python tools/reproduce.py --only {experiment}</code>" in page
+
+
+def test_a_curve_has_a_line_for_every_seed(book):
+    from hiernav.report.figures import BASELINE, OURS, training
+
+    figure = training(book, "doggo", "reach_rate", "reach rate")
+    for color, seeds in ((OURS, 2), (BASELINE, 3)):
+        assert len(re.findall(rf"stroke: {color}; stroke-opacity: 0.35", figure)) == seeds
+    assert "ours (2 seeds)" in figure and ">reach rate<" in figure
+
+
+def test_small_films_are_in_the_page_and_large_ones_are_links(results, tmp_path):
+    folder = tmp_path / "results"
+    cells = [cell for cell in made_up.CELLS.values() if cell.kind == "film"][:2]
+    for cell, size in zip(cells, (100, FILM_LIMIT + 1), strict=True):
+        write_result(folder, made_up.result_of(cell))
+        (folder / "films" / f"{cell.name}.gif").write_bytes(b"G" * size)
+    page = render(Book.open(folder), tmp_path)
+    assert 'src="data:image/gif;base64,R0dH' in page
+    assert f'href="results/films/{cells[1].name}.gif"' in page
+
+
+def test_a_damaged_result_is_named_on_the_page_and_by_the_command(results, tmp_path, capsys):
+    folder = tmp_path / "results"
+    cell = made_up.CELLS["table3/point-shipped-gremlin"]
+    write_result(folder, made_up.result_of(cell))
+    path = result_path(folder, cell.id)
+    path.write_text(path.read_text()[:-20])
+    out = tmp_path / "page" / "report.html"
+    assert cli.main(["report", "--results", str(folder), "--out", str(out)]) == 1
+    assert str(path) in capsys.readouterr().err
+    assert str(path) in html.unescape(out.read_text())
+    path.unlink()
+    assert cli.main(["report", "--results", str(folder), "--out", str(out)]) == 0
+    assert cli.main(["report", "--results", str(tmp_path / "nothing"), "--out", str(out)]) == 2
+
+
+def test_results_of_another_bundle_are_marked(tmp_path):
+    for name in ("configs", "deploy/bundles/point"):
+        (tmp_path / name).mkdir(parents=True)
+        for file in (made_up.ROOT / name).iterdir():
+            if file.is_file():
+                (tmp_path / name / file.name).write_bytes(file.read_bytes())
+    cells = [c for c in made_up.CELLS.values() if c.kind == "evaluate" and c.seed is None][:2]
+    places = Places(made_up.ROOT, tmp_path, tmp_path)
+    write_result(tmp_path / "results", made_up.result_of(cells[0], key=cell_key(cells[0], places)))
+    write_result(tmp_path / "results", made_up.result_of(cells[1]))
+    book = Book.open(tmp_path / "results")
+    assert book.changed == {cells[1].id}
+    assert cells[1].id in render(book) and "makes them again" in render(book)
+
+
+def with_reach(rate: float):
+    """Made up results of which the doggo's shipped ones reach as often as said, without a step too many."""
+
+    def change(cell):
+        if (cell.experiment, cell.robot, cell.variant) != ("table3", "doggo", "shipped"):
+            return None
+        result = made_up.result_of(cell)
+        reached = round(1000 * rate)
+        changes = {"reach_rate": rate, "steps_mean": 30.0, "reach_ci95": [rate - 0.01, rate + 0.01],
+                   "endings": {"goal": reached, "timeout": 1000 - reached}}  # fmt: skip
+        metrics = {protocol: {**values, **changes} for protocol, values in result.metrics.items()}
+        return msgspec.structs.replace(result, metrics=metrics)
+
+    return change
+
+
+@pytest.mark.parametrize(("rate", "met"), [(1.0, True), (0.9, False)])
+def test_targets_are_judged_by_the_numbers(tmp_path, rate, met):
+    made_up.write_all(tmp_path / "results", with_reach(rate))
+    book = Book.open(tmp_path / "results")
+    by_target = {finding.target: finding for finding in told.findings(book)}
+    first = next(f for target, f in by_target.items() if target.startswith("Every cell of Table III"))
+    strict = next(f for target, f in by_target.items() if "doggo, shipped" in target)
+    assert first.met is strict.met is met
+    short = told.shortfalls(book, "doggo")
+    if met:
+        assert not short and first.text == "met for 5 of 5 worlds"
+    else:
+        assert "gremlin (reach rate 0.900 against 1.00)" in first.text and "gremlin (0.900)" in strict.text
+        assert short[0] == (
+            "pillar(2,2,10): 100 of 1000 episodes fail, 100 by reaching the cap on steps. "
+            "Whether the plans or the skill are the cause is not known: A* as planner was not run yet."
+        )
+
+
+def test_the_page_is_written_whole(tmp_path):
+    made_up.write_all(tmp_path / "results", with_reach(1.0))
+    book = write_report(tmp_path / "results", tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert text.startswith("<!doctype html>") and text.endswith("</html>\n")
+    assert len(book.results) == 6
+    assert not list(tmp_path.glob("*.part"))
