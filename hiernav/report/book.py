@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.evaluate import wilson_interval
-from hiernav.reproduce.cells import Places, cell_key
+from hiernav.reproduce.cells import Cell, Places, cell_key
 from hiernav.reproduce.experiments import catalogue
 from hiernav.reproduce.results import Drive, Result, drive_of, read_results
 
@@ -76,8 +76,8 @@ class Book:
     """A line for each file that cannot be used."""
     changed: set[str] = field(default_factory=set)
     """Results whose settings or bundle are no longer those of the repository."""
-    planned: dict[str, int] = field(default_factory=dict)
-    """Experiment -> cells; empty away from the repository."""
+    cells: list[Cell] = field(default_factory=list)
+    """All that there is to run; empty away from the repository."""
 
     @classmethod
     def open(cls, folder: Path) -> Book:
@@ -92,8 +92,7 @@ class Book:
             most = max((result.seed + 1 for result in results if result.seed is not None), default=1)
             keys = {cell.id: cell_key(cell, places) for cell in catalogue(root, seeds=max(5, most))}
             book.changed = {r.id for r in results if keys.get(r.id) != r.key}
-            for cell in catalogue(root):
-                book.planned[cell.experiment] = book.planned.get(cell.experiment, 0) + 1
+            book.cells = catalogue(root)
         return book
 
     def group(self, experiment: str, variant: str, robot: str | None = None, world: str | None = None) -> Group:
@@ -111,9 +110,12 @@ class Book:
             tuple(result for result in found if result.state == "failed"),
         )
 
-    def variants(self, experiment: str) -> list[str]:
-        """Variants that there are results of, in the order of their names."""
-        return sorted({result.variant for result in self.results if result.experiment == experiment})
+    def knows(self, experiment: str, variant: str, robot: str) -> bool:
+        """Whether there is such a thing to run, as far as is known: a departure may change nothing for a robot."""
+        entries: list[Cell | Result] = [*self.cells, *self.results]
+        return not self.cells or any(
+            (entry.experiment, entry.variant, entry.robot) == (experiment, variant, robot) for entry in entries
+        )
 
 
 def curve(result: Result, name: str, stage: str = "evaluation") -> tuple[np.ndarray, np.ndarray]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import json
+from collections import Counter
 from html import escape
 from pathlib import Path
 
 from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
-from hiernav.reproduce.experiments import ROBOTS, WORLDS
+from hiernav.reproduce.experiments import EXPERIMENTS, ROBOTS, WORLDS
 from hiernav.run import write_atomically
 
 FILM_LIMIT = 120_000
@@ -191,19 +192,22 @@ def _film(path: Path, beside: Path) -> str | None:
 
 def _provenance(book: Book) -> str:
     results = book.results
-    commits: dict[str, int] = {}
-    for result in results:
-        name = (result.commit or "no repository")[:10] + (" with changes" if result.dirty else "")
-        commits[name] = commits.get(name, 0) + 1
+    commits = Counter(
+        (result.commit or "no repository")[:10] + (" with changes" if result.dirty else "") for result in results
+    )
     machines = sorted({f"{r.machine.cpu}, {r.machine.cores} cores, {r.machine.system}" for r in results})
     versions = sorted({json.dumps(r.machine.versions, sort_keys=True) for r in results})
     failed = [r for r in results if r.state == "failed"]
     rows = []
-    for name, planned in (book.planned or {r.experiment: 0 for r in results}).items():
+    planned_of = Counter(cell.experiment for cell in book.cells)
+    for name in EXPERIMENTS:
+        planned = planned_of[name]
         mine = [r for r in results if r.experiment == name]
         done, wrong = sum(r.state == "done" for r in mine), sum(r.state == "failed" for r in mine)
         hours = sum(r.seconds for r in mine) / 3600
-        rows.append([name, str(done), str(wrong), str(planned - len(mine) if planned else "?"), f"{hours:.2f} h"])
+        rows.append(
+            [name, str(done), str(wrong), str(max(planned - len(mine), 0)) if planned else "?", f"{hours:.2f} h"]
+        )
     parts = [
         "<p>Every number is from a file in <code>results/</code>, with its seed, commit, settings, machine, duration "
         "and the command that makes it.</p>",

@@ -142,6 +142,8 @@ def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]
     names = ("reach_rate", "steps_mean", "collisions_mean")
     rows: list[list[str]] = []
     for robot, variant, label in kinds:
+        if not book.knows(experiment, variant, robot):
+            continue
         group = book.group(experiment, variant, robot)
         if experiment != "sample_efficiency":
             ours = book.group("sample_efficiency", "ours", robot)
@@ -159,10 +161,14 @@ def cell(group: Group, name: str, protocol: str = "strict", bar: float | None = 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], first: str) -> str:
     """HTML of a table that scrolls by itself on a narrow screen; cells are HTML."""
     head = "".join(f"<th>{text}</th>" for text in (first, *heads))
-    body = "".join(
-        f"<tr><th scope=row>{row[0]}</th>" + "".join(f"<td>{text}</td>" for text in row[1:]) + "</tr>" for row in rows
-    )
+    body = "".join(f"<tr><th scope=row>{row[0]}</th>{_cells(row[1:])}</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _cells(texts: Sequence[str]) -> str:
+    if set(texts) == {NOT_RUN}:
+        return f'<td colspan="{len(texts)}">{NOT_RUN}</td>'
+    return "".join(f"<td>{text}</td>" for text in texts)
 
 
 def _shown(estimate: Estimate | None, name: str, failed: int, bar: float | None, fewer: bool) -> str:
