@@ -21,7 +21,7 @@ from hiernav import cli
 from hiernav.config import describe_config, load_config
 from hiernav.evaluate import wilson_interval
 
-COMMANDS = ("train", "evaluate", "watch", "export", "world", "config")
+COMMANDS = ("train", "evaluate", "watch", "export", "report", "world", "config")
 
 
 @pytest.fixture
