@@ -91,22 +91,24 @@ class DirectSACLoss(SACLoss):
         scaled = torch.cat([batch["observation"], following["observation"]]).mul_(self._scale[0])
         scaled.clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
         actions = _Actions(*self._actor.forward(scaled)[0].chunk(2, dim=-1))
-        now, later = scaled[:size], scaled[size:]
+
+        # the critics judge the actions of the policy and, behind them, those of the batch
+        pairs = torch.cat([scaled, actions.action], dim=-1)
+        pairs, later = pairs[:size], pairs[size:]
+        judged = self._critics.forward(torch.cat([pairs, torch.cat([scaled[:size], batch["action"]], dim=-1)]))
+        merits, values = judged[:, :size], judged[:, size:]
 
         # critics: mean squared distance to reward and discounted soft value
-        value = self._targets.forward(torch.cat([later, actions.action[size:]], dim=-1)).amin(0)
+        value = self._targets.forward(later).amin(0)
         value -= alpha * actions.log_prob[size:]
-        target = following["reward"] + self.value_estimator.gamma * ~following["terminated"] * value
-        values = self._critics.forward(torch.cat([now, batch["action"]], dim=-1))
-        errors = values - target
-        self._critics.backward(errors * (2.0 / size))
+        errors = values - (following["reward"] + self.value_estimator.gamma * ~following["terminated"] * value)
+        self._critics.backward(errors * (2.0 / size), slice(size, None))
 
         # actor: mean of alpha log pi less the smaller value; the gradient passes through the critic it is of
-        merits = self._critics.forward(torch.cat([now, actions.action[:size]], dim=-1))
         merit, which = merits.min(0, keepdim=True)
         chosen = torch.zeros_like(merits).scatter_(0, which, -1.0 / size)
-        by_action = self._critics.backward_to_inputs(chosen, slice(now.shape[-1], None))
-        self._actor.backward(actions.slope(by_action, alpha / size)[None])
+        by_action = self._critics.backward_to_inputs(chosen, slice(size), slice(scaled.shape[-1], None))
+        self._actor.backward(actions.slope(by_action, alpha / size)[None], slice(size))
         log_prob = actions.log_prob[:size]
 
         # temperature: until the entropy is the target

@@ -36,7 +36,7 @@ class Perceptrons:
             The parameters are moved: from here on they are views of `weights`.
         weights: float32 memory for them, `count(tree)` long.
         gradients: as much for their gradients; None for networks that do not learn.
-        precision: of the products. Weights and gradients are kept, and outputs computed, in float32.
+        precision: of the products. Weights and gradients are kept, and the head computed, in float32.
     """
 
     def __init__(
@@ -52,14 +52,18 @@ class Perceptrons:
             for tensor, place in zip(layer, places, strict=True):
                 tensor.data = place.copy_(tensor.data)
         self._master, self._weights = weights, weights.to(precision)
-        self._layers = _layers(self._weights, shapes)
+        *self._hidden, self._reduced_head = _layers(self._weights, shapes)
         self._head = _layers(weights, shapes)[-1]
         self.copies = len(self._head.weight)
         if gradients is not None:
-            self._master_gradients, self._gradients = gradients, gradients.to(precision)
-            self._layer_gradients = _layers(self._gradients, shapes)
+            self._head_gradients = _layers(gradients, shapes)[-1]
+            # the head's come last
+            self._master_gradients = gradients[: -sum(shape.numel() for shape in shapes[-1])]
+            self._gradients = self._master_gradients.to(precision)
+            self._hidden_gradients = _layers(self._gradients, shapes[:-1])
         self._precision = precision
         self._kept: list[torch.Tensor] = []
+        self._last = weights
         self._statistics: dict[int, list[tuple[torch.Tensor, torch.Tensor]]] = {}
         self._rooms: dict[tuple[str, int], torch.Tensor] = {}
 
@@ -72,66 +76,66 @@ class Perceptrons:
         """Outputs (K, B, O) of all networks for the same inputs (B, I)."""
         value = self._cast("inputs", inputs, self._precision).expand(self.copies, -1, -1)
         self._kept = [value]
-        for k, layer in enumerate(self._layers[:-1]):
+        for k, layer in enumerate(self._hidden):
             room = self._room("hidden", k, (*value.shape[:2], layer.bias.shape[-1]), self._precision)
             value = torch.baddbmm(layer.bias, value, layer.weight.mT, out=room)
             if layer.norm:
                 value = self._normalise(k, value)
-            self._kept.append(value.relu_())
-        return torch.baddbmm(self._head.bias, self._cast("last", value, torch.float32), self._head.weight.mT)
+            self._kept.append(_rectify(value))
+        self._last = self._cast("last", value, torch.float32)
+        return torch.baddbmm(self._head.bias, self._last, self._head.weight.mT)
 
-    def backward(self, by_outputs: torch.Tensor) -> None:
-        """Write the gradients of a loss into `gradients`, given its derivative (K, R, O) by the first R outputs."""
-        for k, slope in self._slopes(by_outputs, learning=True):
-            torch.bmm(slope.mT, self._kept[k][:, : slope.shape[1]], out=self._layer_gradients[k].weight)
-            torch.sum(slope, 1, keepdim=True, out=self._layer_gradients[k].bias)
+    def backward(self, by_outputs: torch.Tensor, rows: slice) -> None:
+        """Write the gradients of a loss into `gradients`, given its derivative (K, R, O) by some rows of the outputs."""
+        torch.bmm(by_outputs.mT, self._last[:, rows], out=self._head_gradients.weight)
+        torch.sum(by_outputs, 1, keepdim=True, out=self._head_gradients.bias)
+        for k, slope in self._slopes(by_outputs, rows, learning=True):
+            torch.bmm(slope.mT, self._kept[k][:, rows], out=self._hidden_gradients[k].weight)
+            torch.sum(slope, 1, keepdim=True, out=self._hidden_gradients[k].bias)
         if self._gradients is not self._master_gradients:
             self._master_gradients.copy_(self._gradients)
 
-    def backward_to_inputs(self, by_outputs: torch.Tensor, columns: slice) -> torch.Tensor:
+    def backward_to_inputs(self, by_outputs: torch.Tensor, rows: slice, columns: slice) -> torch.Tensor:
         """The derivative (R, C) of a loss by some columns of the inputs, summed over the networks."""
-        *_, (_, slope) = self._slopes(by_outputs, learning=False)
-        return torch.bmm(slope, self._layers[0].weight[:, :, columns]).sum(0, dtype=torch.float32)
+        *_, (_, slope) = self._slopes(by_outputs, rows, learning=False)
+        return torch.bmm(slope, self._hidden[0].weight[:, :, columns]).sum(0, dtype=torch.float32)
 
-    def _slopes(self, by_outputs: torch.Tensor, learning: bool) -> Iterator[tuple[int, torch.Tensor]]:
-        """Derivatives (K, R, out) by the results of the linear layers, from the head to the first."""
+    def _slopes(self, by_outputs: torch.Tensor, rows: slice, learning: bool) -> Iterator[tuple[int, torch.Tensor]]:
+        """Derivatives (K, R, out) by the results of the hidden layers' products, from the last to the first."""
         slope = self._cast("slope", by_outputs, self._precision)
-        yield len(self._layers) - 1, slope
-        for k in reversed(range(len(self._layers) - 1)):
-            weight = self._layers[k + 1].weight
+        for k in reversed(range(len(self._hidden))):
+            weight = (*self._hidden, self._reduced_head)[k + 1].weight
             room = self._room("slope", k, (*slope.shape[:2], weight.shape[-1]), self._precision)
             # behind a single output, the product is one of a column and a row
             (torch.mul if weight.shape[1] == 1 else torch.bmm)(slope, weight, out=room)
-            # where the layer was silent nothing comes through
-            kept = self._kept[k + 1][:, : slope.shape[1]]
-            slope = torch.ops.aten.threshold_backward.grad_input(room, kept, 0, grad_input=room)
-            if self._layers[k].norm:
-                self._denormalise(k, slope, learning)
+            slope = _silence(room, self._kept[k + 1][:, rows])
+            if self._hidden[k].norm:
+                self._denormalise(k, slope, rows, learning)
             yield k, slope
 
     def _normalise(self, k: int, value: torch.Tensor) -> torch.Tensor:
         """Layer norm (K, B, out) of hidden layer k."""
         normed, size = self._room("normed", k, value.shape, self._precision), value.shape[-1:]
         self._statistics[k] = []
-        for n, (gain, shift) in enumerate(zip(*self._layers[k].norm, strict=True)):
+        for n, (gain, shift) in enumerate(zip(*self._hidden[k].norm, strict=True)):
             result, mean, rstd = torch.native_layer_norm(value[n], size, gain, shift, _NORM_EPSILON)
             normed[n].copy_(result)
             self._statistics[k].append((mean, rstd))
         return normed
 
-    def _denormalise(self, k: int, slope: torch.Tensor, learning: bool) -> None:
+    def _denormalise(self, k: int, slope: torch.Tensor, rows: slice, learning: bool) -> None:
         """Turn the derivative (K, R, out) by the layer norm's results into that by its inputs, in place."""
-        rows, size = slope.shape[1], slope.shape[-1:]
+        size = slope.shape[-1:]
         value = self._rooms["hidden", k]
         for n, ((gain, shift), (mean, rstd)) in enumerate(
-            zip(zip(*self._layers[k].norm, strict=True), self._statistics[k], strict=True)
+            zip(zip(*self._hidden[k].norm, strict=True), self._statistics[k], strict=True)
         ):
             inputs, *weights = torch.ops.aten.native_layer_norm_backward(
-                slope[n], value[n, :rows], size, mean[:rows], rstd[:rows], gain, shift, [True, learning, learning]
+                slope[n], value[n, rows], size, mean[rows], rstd[rows], gain, shift, [True, learning, learning]
             )
             slope[n].copy_(inputs)
             if learning:
-                for place, gradient in zip(self._layer_gradients[k].norm, weights, strict=True):
+                for place, gradient in zip(self._hidden_gradients[k].norm, weights, strict=True):
                     place[n].copy_(gradient)
 
     def _cast(self, name: str, values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
@@ -153,6 +157,26 @@ def count(tree: TensorDictBase) -> int:
 def parameters(tree: TensorDictBase) -> list[torch.Tensor]:
     """The parameters of networks in the order in which `Perceptrons` puts them into memory."""
     return [tensor for layer in _tensors(tree) for tensor in layer]
+
+
+def _rectify(values: torch.Tensor) -> torch.Tensor:
+    """ReLU in place."""
+    _ordered(values).clamp_min_(0)
+    return values
+
+
+def _silence(slope: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
+    """Nothing comes through a ReLU where its results `kept` are zero; in place."""
+    if kept.dtype != torch.bfloat16:
+        return torch.ops.aten.threshold_backward.grad_input(slope, kept, 0, grad_input=slope)
+    # the smallest positive number has the bits of the integer one
+    slope.view(torch.int16).mul_(kept.view(torch.int16).clamp_max(1))
+    return slope
+
+
+def _ordered(values: torch.Tensor) -> torch.Tensor:
+    """The same memory as numbers that are above and below zero where `values` are, and faster to compare."""
+    return values.view(torch.int16) if values.dtype == torch.bfloat16 else values
 
 
 def _tensors(tree: TensorDictBase) -> list[list[torch.Tensor]]:
