@@ -108,7 +108,7 @@ class Perceptrons:
             room = self._room("slope", k, (*slope.shape[:2], weight.shape[-1]), self._precision)
             # behind a single output, the product is one of a column and a row
             (torch.mul if weight.shape[1] == 1 else torch.bmm)(slope, weight, out=room)
-            slope = _silence(room, self._kept[k + 1][:, rows])
+            slope = self._silence(room, self._kept[k + 1][:, rows])
             if self._hidden[k].norm:
                 self._denormalise(k, slope, rows, learning)
             yield k, slope
@@ -138,6 +138,15 @@ class Perceptrons:
                 for place, gradient in zip(self._hidden_gradients[k].norm, weights, strict=True):
                     place[n].copy_(gradient)
 
+    def _silence(self, slope: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
+        """Nothing comes through a ReLU where its results `kept` are zero; in place."""
+        if self._precision != torch.bfloat16:
+            return torch.ops.aten.threshold_backward.grad_input(slope, kept, 0, grad_input=slope)
+        # the bits of the smallest positive number are those of the integer one
+        open_ = torch.clamp_max(_ordered(kept), 1, out=self._room("open", -1, kept.shape, torch.int16))
+        _ordered(slope).mul_(open_)
+        return slope
+
     def _cast(self, name: str, values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
         return values if values.dtype == dtype else self._room(name, -1, values.shape, dtype).copy_(values)
 
@@ -163,15 +172,6 @@ def _rectify(values: torch.Tensor) -> torch.Tensor:
     """ReLU in place."""
     _ordered(values).clamp_min_(0)
     return values
-
-
-def _silence(slope: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
-    """Nothing comes through a ReLU where its results `kept` are zero; in place."""
-    if kept.dtype != torch.bfloat16:
-        return torch.ops.aten.threshold_backward.grad_input(slope, kept, 0, grad_input=slope)
-    # the smallest positive number has the bits of the integer one
-    slope.view(torch.int16).mul_(kept.view(torch.int16).clamp_max(1))
-    return slope
 
 
 def _ordered(values: torch.Tensor) -> torch.Tensor:
