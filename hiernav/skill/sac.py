@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModule, TensorDictModuleBase
+from torch.optim.adam import adam
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
@@ -116,7 +117,7 @@ class Learner:
             action_spec=Bounded(-1.0, 1.0, (action_dim,)),
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
-        self.optimizer = torch.optim.Adam([self.loss.weights], settings.learning_rate, fused=True)
+        self._optimizer = _Adam(self.loss.weights, settings.learning_rate)
         self._actor_weights = list(self._learning.parameters())
         self._mean_weights = list(self._averaging.parameters())
         self.updates = 0
@@ -126,7 +127,7 @@ class Learner:
         if self.device.type != "cpu":
             batch = batch.to(self.device)
         metrics = self.loss.differentiate(batch)
-        self.optimizer.step()
+        self._optimizer.step()
         self.loss.move_targets(self.settings.tau)
         self.updates += 1
         if self._averaging is not self._learning:
@@ -156,16 +157,48 @@ class Learner:
         return {
             "loss": self.loss.state_dict(),
             "average": self._averaging.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": self._optimizer.state,
             "updates": self.updates,
         }
 
     def load_state_dict(self, state: dict) -> None:
         self.loss.load_state_dict(state["loss"])
         self._averaging.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        for name, value in self._optimizer.state.items():
+            value.copy_(state["optimizer"][name])
         self.updates = state["updates"]
         self.publish()
+
+
+class _Adam:
+    """torch's fused Adam on one tensor; what `torch.optim.Adam` does around it takes two thirds of its time again."""
+
+    def __init__(self, weights: torch.Tensor, learning_rate: float) -> None:
+        self._weights, self._learning_rate = weights, learning_rate
+        self.state = {
+            "step": torch.zeros((), device=weights.device),
+            "mean": torch.zeros_like(weights, requires_grad=False),
+            "mean_square": torch.zeros_like(weights, requires_grad=False),
+        }
+
+    @torch.no_grad()
+    def step(self) -> None:
+        adam(
+            [self._weights],
+            [self._weights.grad],
+            [self.state["mean"]],
+            [self.state["mean_square"]],
+            [],
+            [self.state["step"]],
+            fused=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self._learning_rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
 
 
 def make_policy(actor: Actor, action_dim: int) -> ProbabilisticActor:

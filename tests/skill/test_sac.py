@@ -16,6 +16,7 @@ from torchrl.objectives import SACLoss  # noqa: E402
 from hiernav.config import load_config  # noqa: E402
 from hiernav.nav.observation import observation_layout  # noqa: E402
 from hiernav.skill.networks import Actor, Critic  # noqa: E402
+from hiernav.skill.perceptrons import _rectify  # noqa: E402
 from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 from hiernav.skill.train import alpha_floor, make_learner  # noqa: E402
 
@@ -232,6 +233,23 @@ def test_an_update_takes_batches_of_any_size() -> None:
 def test_a_loss_whose_parameters_share_memory_refuses_to_be_moved() -> None:
     with pytest.raises(RuntimeError, match="device"):
         learner().loss.to(torch.float64)
+
+
+def test_the_optimiser_steps_as_adam_of_torch_does() -> None:
+    source = learner(SacSettings(hidden=(16, 16), learning_rate=0.01))
+    weights = source.loss.weights.detach().clone().requires_grad_()
+    adam = torch.optim.Adam([weights], 0.01, fused=True)
+    for k in range(3):
+        source.update(batch(k))
+        weights.grad = source.loss.weights.grad.clone()
+        adam.step()
+    assert torch.equal(source.loss.weights, weights)
+
+
+def test_rectifying_by_bits_is_rectifying() -> None:
+    edges = [0.0, -0.0, 1e-40, -1e-40, 2.5, -2.5, torch.inf, -torch.inf, torch.nan]
+    values = torch.cat([torch.tensor(edges), torch.randn(100)]).to(torch.bfloat16)
+    assert_close(_rectify(values.clone()), values.relu(), rtol=0, atol=0, equal_nan=True)
 
 
 # checkpoints
