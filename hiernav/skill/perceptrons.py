@@ -87,7 +87,7 @@ class Perceptrons:
         return torch.baddbmm(self._head.bias, self._last, self._head.weight.mT)
 
     def backward(self, by_outputs: torch.Tensor, rows: slice) -> None:
-        """Write the gradients of a loss into `gradients`, given its derivative (K, R, O) by some rows of the outputs."""
+        """Write the gradients of a loss into `gradients`, given its derivative (K, R, O) by those rows of outputs."""
         torch.bmm(by_outputs.mT, self._last[:, rows], out=self._head_gradients.weight)
         torch.sum(by_outputs, 1, keepdim=True, out=self._head_gradients.bias)
         for k, slope in self._slopes(by_outputs, rows, learning=True):
@@ -173,7 +173,7 @@ def _rectify(values: torch.Tensor) -> torch.Tensor:
     """ReLU in place."""
     if values.dtype != torch.bfloat16:
         return values.relu_()
-    # by their bits, which is four times as fast: as integers, numbers below zero are at most that of -inf, NaN are above
+    # by their bits, four times as fast: as integers, numbers below zero are at most what -inf is, and NaN is above
     torch.threshold_(values.view(torch.int16), _MINUS_INFINITY, 0)
     return values
 
