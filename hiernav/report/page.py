@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 
 from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
-from hiernav.reproduce.experiments import EXPERIMENTS, ROBOTS, WORLDS
+from hiernav.reproduce.experiments import DEPARTURE_WORLDS, EXPERIMENTS, ROBOTS, WORLDS
 from hiernav.run import write_atomically
 
 FILM_LIMIT = 120_000
@@ -135,11 +136,10 @@ def _replanning(book: Book) -> str:
     return (
         "<p>The rule against fixed periods, with the bundles that ship; the paper’s rule planned every 8.5 steps of "
         "the doggo (10 Hz; the car runs at 25 Hz, the point at 50 Hz).</p>"
-        + _gallery([(figures.replanning(book, w), w) for w in ("pillar(2,2,10)", "gremlin", "four-room")])
-        + tables.replanning(book)
-        + "<details><summary>Trained with fixed periods, as in the paper</summary>"
-        + tables.trained_periods(book)
-        + "</details>"
+        + _gallery([(figures.replanning(book, world), world) for world in DEPARTURE_WORLDS])
+        + _by_robot(lambda robot: tables.replanning(book, robot))
+        + "<h3>Trained with fixed periods, as in the paper</h3>"
+        + _by_robot(lambda robot: tables.trained_periods(book, robot))
         + _command("--only replanning")
     )
 
@@ -148,9 +148,9 @@ def _ablations(book: Book) -> str:
     return (
         "<p>Each departure from the paper switched off (layer normalisation and learned plans: switched on). The frame "
         "of the waypoints cannot be switched: the observation is built in the body frame alone.</p>"
-        "<h3>In driving</h3>" + tables.driving_ablations(book) + "<h3>In training</h3>"
+        "<h3>In driving</h3>" + _by_robot(lambda robot: tables.driving_ablations(book, robot)) + "<h3>In training</h3>"
         "<p>Driven with A* plans, 1000 strict episodes in pillar(2,2,10); returns by the baseline’s reward.</p>"
-        + tables.trained_ablations(book)
+        + _by_robot(lambda robot: tables.trained_ablations(book, robot))
         + _command("--only ablations")
     )
 
@@ -162,13 +162,13 @@ def _films(book: Book, beside: Path) -> str:
             group = book.group("films", "shipped", robot, world)
             for result in group.done:
                 count, reached = result.settings.get("episodes"), result.metrics.get("reached")
-                caption = f"{robot}, {world}: {reached} of {count} reach the goal"
+                caption = f"{robot}, {world}: {reached} of {count} reached the goal"
                 shown.append((_film(book.folder / "films" / result.metrics["file"], beside), caption))
             shown += [
                 (f'<p class="short">failed: {escape(r.error or "")}</p>', f"{robot}, {world}") for r in group.failed
             ]
     return (
-        "<p>The first episodes of the strict protocol, from above, one and a half times as fast as they are.</p>"
+        "<p>The first episode of the strict protocol in each world, from above, twice as fast as it is.</p>"
         + _gallery(shown, "films")
         + _command("--only films")
     )
@@ -233,6 +233,16 @@ def _damaged(book: Book) -> str:
     return f'<p class="short">Result files that cannot be used:</p><ul>{items}</ul>'
 
 
+def _by_robot(make: Callable[[str], str]) -> str:
+    """A table for each robot, folded up."""
+    parts = []
+    for robot in reversed(ROBOTS):
+        text = make(robot)
+        folded = f"<details><summary>{robot}</summary>{text}</details>"
+        parts.append(f"<p>{robot}: {tables.NOT_RUN}</p>" if tables.is_empty(text) else folded)
+    return "".join(parts)
+
+
 def _gallery(shown: list[tuple[str | None, str]], kind: str = "figures") -> str:
     """Figures side by side where there is room."""
     parts = [f"<figure>{text}<figcaption>{escape(caption)}</figcaption></figure>" for text, caption in shown if text]
@@ -260,7 +270,7 @@ nav{display:flex;flex-wrap:wrap;gap:.3rem 1rem}a{color:inherit}
 .wide{overflow-x:auto;max-width:100%;margin:.5rem 0}
 table{border-collapse:collapse;font-size:.88rem;font-variant-numeric:tabular-nums}
 th,td{padding:.35rem .7rem;border-bottom:1px solid var(--line);text-align:right;vertical-align:top;line-height:1.3}
-td{white-space:nowrap}thead th{color:var(--soft);font-weight:600;vertical-align:bottom}
+td{white-space:nowrap}td.all{text-align:left}thead th{color:var(--soft);font-weight:600;vertical-align:bottom}
 th:first-child{text-align:left;position:sticky;left:0;background:var(--paper)}
 th[scope=row]{font-weight:500}
 .targets{list-style:none;padding:0}.targets li{margin:.8rem 0;line-height:1.4}.theirs{color:var(--soft)}

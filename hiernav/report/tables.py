@@ -8,7 +8,7 @@ from html import escape
 
 from hiernav.report import paper
 from hiernav.report.book import Book, Estimate, Group, of_seeds
-from hiernav.reproduce.experiments import DRIVING, PERIODS, ROBOTS, TRAINING, WORLDS
+from hiernav.reproduce.experiments import DEPARTURE_WORLDS, DRIVING, PERIODS, ROBOTS, TRAINING, WORLDS
 
 NOT_RUN = '<span class="none">not run yet</span>'
 _DIGITS = {"reach_rate": 3, "steps_mean": 1, "collisions_mean": 2, "collision_free_rate": 3, "spl_mean": 3}
@@ -89,53 +89,52 @@ def table2(book: Book) -> str:
     return table(["the paper", "its network, ours", "our network"], rows, "samples")
 
 
-def replanning(book: Book) -> str:
-    """Fixed periods against the rule, of the shipped bundles."""
+def replanning(book: Book, robot: str) -> str:
+    """Fixed periods against the rule, of the shipped bundle."""
     names = ("steps_between_plans", "reach_rate", "steps_mean", "collisions_mean")
-    rows = []
-    for robot in ROBOTS:
-        for world in ("pillar(2,2,10)", "gremlin", "four-room"):
-            kinds = [("table3", "shipped", "the rule")]
-            kinds += [("replanning", f"period-{period}", f"every {period} steps") for period in PERIODS]
-            for experiment, variant, label in kinds:
-                group = book.group(experiment, variant, robot, world)
-                first = f"{robot}, {escape(world)}<br><small>{label}</small>"
-                rows.append([first, *(cell(group, name) for name in names)])
-    return table([_HEADS[name] for name in names], rows, "robot, world")
+    kinds = [(f"period-{period}", f"every {period} steps") for period in PERIODS]
+    return _beside_shipped(book, robot, "replanning", "the rule", kinds, names)
 
 
-def trained_periods(book: Book) -> str:
+def trained_periods(book: Book, robot: str) -> str:
     """Trainings with fixed periods, driven with A* plans."""
-    kinds = [(robot, f"trained-period-{period}", f"every {period} steps") for robot in ROBOTS for period in PERIODS]
+    kinds = [(robot, f"trained-period-{period}", f"every {period} steps") for period in PERIODS]
     return _trainings(book, "replanning", kinds)
 
 
-def driving_ablations(book: Book) -> str:
+def driving_ablations(book: Book, robot: str) -> str:
     """Departures that were switched off in driving alone."""
     names = ("reach_rate", "steps_mean", "collisions_mean", "collision_free_rate")
-    rows = []
-    for robot in ROBOTS:
-        for world in ("pillar(2,2,10)", "gremlin", "four-room"):
-            for experiment, variant, label in (
-                ("table3", "shipped", "as shipped"),
-                *(("ablations", name, WHAT[name]) for name in DRIVING),
-            ):
-                group = book.group(experiment, variant, robot, world)
-                first = f"{robot}, {escape(world)}<br><small>{label}</small>"
-                rows.append([first, *(cell(group, name) for name in names)])
-    return table([_HEADS[name] for name in names], rows, "robot, world")
+    return _beside_shipped(book, robot, "ablations", "as shipped", [(name, WHAT[name]) for name in DRIVING], names)
 
 
-def trained_ablations(book: Book) -> str:
+def trained_ablations(book: Book, robot: str) -> str:
     """Departures that were trained without."""
-    kinds = [(robot, name, WHAT[name]) for robot in ROBOTS for name in TRAINING]
-    return _trainings(book, "ablations", kinds)
+    return _trainings(book, "ablations", [(robot, name, WHAT[name]) for name in TRAINING])
+
+
+def is_empty(html: str) -> bool:
+    """Whether nothing in a table was run."""
+    return "<td>" not in html
 
 
 def sample_efficiency(book: Book) -> str:
     """Ends of the trainings, driven with A* plans; returns of both by the baseline's reward."""
     kinds = [(robot, variant, variant) for robot in ROBOTS for variant in ("ours", "baseline")]
     return _trainings(book, "sample_efficiency", kinds)
+
+
+def _beside_shipped(
+    book: Book, robot: str, experiment: str, shipped: str, kinds: Sequence[tuple[str, str]], names: Sequence[str]
+) -> str:
+    rows = []
+    for world in DEPARTURE_WORLDS:
+        found = [(label, book.group(experiment, variant, robot, world)) for variant, label in kinds]
+        if any(group.done or group.failed for _, group in found):
+            found.insert(0, (shipped, book.group("table3", "shipped", robot, world)))
+        for label, group in found:
+            rows.append([f"{escape(world)}<br><small>{label}</small>", *(cell(group, name) for name in names)])
+    return table([_HEADS[name] for name in names], rows, "world")
 
 
 def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]]) -> str:
@@ -145,10 +144,9 @@ def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]
         if not book.knows(experiment, variant, robot):
             continue
         group = book.group(experiment, variant, robot)
-        if experiment != "sample_efficiency":
+        if experiment != "sample_efficiency" and not rows:
             ours = book.group("sample_efficiency", "ours", robot)
-            if not any(row[0] == f"{robot}<br><small>ours</small>" for row in rows):
-                rows.append([f"{robot}<br><small>ours</small>", *(cell(ours, n) for n in (*names, "return_mean"))])
+            rows.append([f"{robot}<br><small>ours</small>", *(cell(ours, n) for n in (*names, "return_mean"))])
         rows.append([f"{robot}<br><small>{label}</small>", *(cell(group, n) for n in (*names, "return_mean"))])
     return table([*(_HEADS[name] for name in names), "return"], rows, "robot, training")
 
@@ -167,7 +165,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], first: str) -> st
 
 def _cells(texts: Sequence[str]) -> str:
     if set(texts) == {NOT_RUN}:
-        return f'<td colspan="{len(texts)}">{NOT_RUN}</td>'
+        return f'<td class="all" colspan="{len(texts)}">{NOT_RUN}</td>'
     return "".join(f"<td>{text}</td>" for text in texts)
 
 

@@ -32,9 +32,14 @@ EXPERIMENTS = {
 }
 ROBOTS = ("point", "car", "doggo")
 WORLDS = ("pillar(2,2,10)", "gremlin", "pillar(3,3,25)", "pillar(4,4,40)", "two-room", "four-room")
+DEPARTURE_WORLDS = ("pillar(2,2,10)", "gremlin", "four-room")
+"""In which fixed periods and departures of driving are looked at."""
 SEEDS = {"point": 5, "car": 5, "doggo": 3}
 ABLATION_SEEDS = TABLE2_SEEDS = 3
 PERIODS = (4, 16, 64)
+
+FILM = {"episodes": 1, "size": 220, "speed": 2.0, "fps": 8.0}
+"""Small enough for a page of eighteen."""
 
 SKILL_SECONDS = {"point": 600.0, "car": 900.0, "doggo": 2400.0}
 PLANNER_SECONDS = {"point": 420.0, "car": 480.0, "doggo": 420.0}
@@ -78,7 +83,6 @@ class Size:
     fine_tuning: tuple[str, ...] = ()
     table2_samples: tuple[int, ...] = (1_000, 10_000, 50_000, 100_000)
     table2_settings: tuple[str, ...] = ()
-    film_episodes: int = 2
     share: float = 1.0
     """Of the usual durations."""
 
@@ -98,7 +102,6 @@ SMOKE = Size(
     fine_tuning=(*_SMALL, "planner.samples=24"),
     table2_samples=(16, 32),
     table2_settings=_SMALL,
-    film_episodes=1,
     share=0.01,
 )  # fmt: skip
 """Everything once, too small to mean anything, to see the machinery work."""
@@ -163,7 +166,7 @@ class _Maker:
             cells.append(
                 self._evaluate("astar", "astar", world, {"planner": "astar"}, bundle=bundle, needs=beside[world])
             )
-        some = [world for world in self.size.worlds if world in (self.size.worlds[0], "gremlin", "four-room")]
+        some = [world for world in self.size.worlds if world in (self.size.worlds[0], *DEPARTURE_WORLDS)]
         for world in some:
             for period in PERIODS:
                 cells.append(
@@ -184,7 +187,7 @@ class _Maker:
                     variant="shipped",
                     world=world,
                     bundle=bundle,
-                    settings={"episodes": self.size.film_episodes},
+                    settings=FILM,
                     seconds=self.size.share * 15.0,
                 )  # fmt: skip
             )

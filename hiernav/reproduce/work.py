@@ -26,7 +26,6 @@ Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done."""
 
 EVALUATION_SEED = 0
-_FILM = FilmSettings(size=240, speed=1.5, fps=10.0)
 
 
 @dataclass
@@ -191,13 +190,14 @@ def _film(cell: Cell, places: Places, report: Report) -> Outcome:
     assert cell.world is not None
     folder, source = _policies(cell, places)
     file, count = places.results / "films" / f"{cell.name}{default_suffix()}", cell.settings["episodes"]
+    look = FilmSettings(**{name: value for name, value in cell.settings.items() if name != "episodes"})
     episodes = make_film(
         open_policies(folder),
         parse_world(cell.world),
         file,
         episodes=count,
         seed=EVALUATION_SEED,
-        settings=_FILM,
+        settings=look,
         on_episode=lambda number, _: report((number + 1) / count, f"{number + 1} of {count} episodes"),
     )
     metrics = {"file": file.name, "bytes": file.stat().st_size, "reached": sum(e.reached for e in episodes)}
