@@ -30,8 +30,6 @@ from hiernav.runtime.trip import RunResult, Trip
 from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, PlanWatch, SaturationWatch, StopWatch
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
-REHEARSALS = 2
-"""Rehearsals of a tick: after the first its memory is at hand, after the second its branches are foreseen too."""
 FLUSH_SECONDS = 1.0
 """What observers are given to bring their data to safety once the robot is braked [s]."""
 MAX_SATURATED = 3
@@ -240,8 +238,12 @@ class Driver:
             if not self.supervisor.latched and self.supervisor.mode is not Mode.INIT:
                 self.supervisor.change(Mode.INIT, "the loop has ended", self.clock.now())
 
-    def _rehearse(self) -> None:
-        """Touch what the next tick will need. Whatever goes wrong here must not go wrong there."""
+    def _rehearse(self, again: bool) -> None:
+        """Touch what the next tick will need. Whatever goes wrong here must not go wrong there.
+
+        The first time a tick in which a plan ends, which has the memory at hand; `again` what most ticks are, which has
+        the processor foresee the branches as well.
+        """
         trip, frame, estimate, occupancy = self._trip, self._last_frame, self._estimate, self._occupancy
         if trip is None or frame is None or estimate is None or occupancy is None:
             return
@@ -252,8 +254,7 @@ class Driver:
             rehearse = getattr(self.robot, "rehearse", None)
             if rehearse is not None:
                 rehearse()
-            for _ in range(REHEARSALS):
-                self._rehearsal(frame, estimate, trip.goal, occupancy)
+            self._rehearsal(frame, estimate, trip.goal, occupancy, anew=not again)
         except Exception:
             log.exception("the rehearsal failed and is dropped")
             self.loop.drop_preparation()

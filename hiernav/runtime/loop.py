@@ -42,7 +42,7 @@ class FixedRateLoop:
         tick: Callable[[float], bool],
         brake: Callable[[], None],
         handle_signals: bool = True,
-        prepare: Callable[[], None] | None = None,
+        prepare: Callable[[bool], None] | None = None,
         lead: float = 0.0,
     ) -> None:
         """
@@ -52,7 +52,8 @@ class FixedRateLoop:
             tick: called with the time [s]; returns True when the loop is done.
             brake: stops the robot.
             handle_signals: turn SIGINT and SIGTERM into an interruption while the loop runs in the main thread.
-            prepare: called just early enough before a deadline to be done by then, where there is time.
+            prepare: called just early enough before a deadline to be done by then, where there is time; with False, and
+                then, if there is time for as much again, with True.
             lead: time before the deadline at which it is begun at most [s].
 
         Raises:
@@ -119,11 +120,7 @@ class FixedRateLoop:
             deadline = start + index * self.period
             if self._prepare is not None and self.clock.now() < deadline - self._ahead:
                 self.clock.sleep_until(deadline - self._ahead)
-                began = self.clock.now()
-                self._prepare()
-                # as late as it may be begun: what lies between would only get cold again
-                longest = max(self.clock.now() - began + 1e-4, 0.95 * self._ahead)
-                self._ahead = min(longest, self._lead)
+                self._prepare_for(deadline)
             self.clock.sleep_until(deadline)
             now = self.clock.now()
             self.phase_error = math.remainder(deadline - start, self.period)
@@ -133,6 +130,16 @@ class FixedRateLoop:
             if self._tick(now):
                 return
             index = self._next_index(start, index)
+
+    def _prepare_for(self, deadline: float) -> None:
+        assert self._prepare is not None
+        began = self.clock.now()
+        self._prepare(False)
+        took = self.clock.now() - began
+        if self._prepare is not None and began + 2.0 * took <= deadline:
+            self._prepare(True)
+        # as late as it may be begun: what lies between would only get cold again
+        self._ahead = min(max(2.0 * took + 1e-4, 0.95 * self._ahead), self._lead)
 
     def _next_index(self, start: float, index: int) -> int:
         """Number of the first deadline that has not passed."""

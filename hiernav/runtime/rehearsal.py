@@ -48,8 +48,12 @@ class Rehearsal:
         self._period, self._radius = agent.control_period, radius
         self._stamp = 0.0
 
-    def __call__(self, frame: SensorFrame, estimate: Estimate, goal: np.ndarray, occupancy: OccupancyMap) -> None:
-        """Rehearse with the last tick's values."""
+    def __call__(
+        self, frame: SensorFrame, estimate: Estimate, goal: np.ndarray, occupancy: OccupancyMap, anew: bool = False
+    ) -> None:
+        """Rehearse with the last tick's values; with `anew` a tick in which a plan ends."""
+        if anew:
+            self._pilot.drop()
         self._stamp += self._period
         self._estimator.update(replace(frame, stamp=self._stamp, fix_stamp=None))
         decision = self._pilot.act(self._stamp, estimate, self._terms.fill(frame), goal, occupancy)

@@ -251,12 +251,14 @@ def test_five_milliseconds_are_kept_on_a_real_clock():
     assert loop.lateness.percentile(50) < 0.001
 
 
-def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_has_no_time_for_it():
+@pytest.mark.parametrize(("lead", "rounds"), [(0.05, 2), (0.015, 1)])
+def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_has_no_time_for_it(lead, rounds):
     clock = FakeClock()
     prepared: list[float] = []
     ticks: list[float] = []
 
-    def prepare() -> None:
+    def prepare(again: bool) -> None:
+        assert again == (rounds == 2 and len(prepared) % 2 == 1)
         prepared.append(clock.now())
         clock.advance(0.01)
 
@@ -265,9 +267,9 @@ def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_ha
         clock.advance(0.24 if len(ticks) == 4 else 0.01)
         return len(ticks) == 200
 
-    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=prepare, lead=0.05)
+    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=prepare, lead=lead)
     loop.run()
     assert ticks == [k * PERIOD for k in range(200)] and loop.overruns == 0
-    assert len(prepared) == 198  # before the first tick and after the long one there was no time
-    assert prepared[0] == pytest.approx(PERIOD - 0.05)
-    assert prepared[-1] == pytest.approx(199 * PERIOD - 0.0101, abs=1e-3)
+    assert len(prepared) == rounds * 198  # before the first tick and after the long one there was no time
+    assert prepared[0] == pytest.approx(PERIOD - lead)
+    assert prepared[-rounds] == pytest.approx(199 * PERIOD - min(0.0201, lead), abs=1e-3)
