@@ -34,7 +34,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="of that run (60)")
     parser.add_argument("--hogs", type=int, default=0, help="processes that compute beside that run (0)")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="of the point robot")
-    parser.add_argument("--rehearsal", type=float, default=0.002, help="before each tick [s]; 0 for none (0.002)")
+    parser.add_argument("--rehearsal", type=float, default=0.0025, help="before each tick [s]; 0 for none (0.0025)")
     parser.add_argument("--normal", action="store_true", help="ask for no real-time scheduling")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
@@ -63,7 +63,7 @@ def bench_loop(bundle: Path, normal: bool = False) -> list[dict[str, Any]]:
 
 
 def measure(
-    rate: int, seconds: float, hogs: int, bundle_path: Path, normal: bool, rehearsal: float = 0.002
+    rate: int, seconds: float, hogs: int, bundle_path: Path, normal: bool, rehearsal: float = 0.0025
 ) -> dict[str, Any]:
     """Drive for some time; all figures in seconds, megabytes and shares."""
     from hiernav.nav.bundle import load_bundle

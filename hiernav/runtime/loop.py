@@ -53,7 +53,7 @@ class FixedRateLoop:
             brake: stops the robot.
             handle_signals: turn SIGINT and SIGTERM into an interruption while the loop runs in the main thread.
             prepare: called just early enough before a deadline to be done by then, where there is time; with False, and
-                then, if there is time for as much again, with True.
+                then, if there is time for that as well, with True.
             lead: time before the deadline at which it is begun at most [s].
 
         Raises:
@@ -76,7 +76,7 @@ class FixedRateLoop:
         self._tick = tick
         self._brake = brake
         self._handle_signals = handle_signals
-        self._prepare, self._lead, self._ahead = prepare, lead, lead
+        self._prepare, self._lead, self._ahead, self._again = prepare, lead, lead, 0.5 * lead
         self._leaving = True
         self._signalled = False
         self._stopped = False
@@ -135,11 +135,14 @@ class FixedRateLoop:
         assert self._prepare is not None
         began = self.clock.now()
         self._prepare(False)
-        took = self.clock.now() - began
-        if self._prepare is not None and began + 2.0 * took <= deadline:
+        first = self.clock.now()
+        again = max(0.95 * self._again, 0.5 * (first - began))  # the first has warmed the caches for it
+        if self._prepare is not None and first + again <= deadline:
             self._prepare(True)
+            again = max(again, self.clock.now() - first)
+        self._again = again
         # as late as it may be begun: what lies between would only get cold again
-        self._ahead = min(max(2.0 * took + 1e-4, 0.95 * self._ahead), self._lead)
+        self._ahead = min(max(first - began + again + 1e-4, 0.95 * self._ahead), self._lead)
 
     def _next_index(self, start: float, index: int) -> int:
         """Number of the first deadline that has not passed."""

@@ -29,8 +29,8 @@ class RealtimeConfig:
     """Keep all pages in memory (mlockall)."""
     cpus: tuple[int, ...] | None = None
     """CPUs this process may run on; None leaves the choice to the system."""
-    rehearsal: float = 0.002
-    """Time before each tick at which one is rehearsed, so that the caches are warm [s]; 0 for none."""
+    rehearsal: float = 0.0025
+    """Time before each tick from which on one is rehearsed, so that the caches are warm [s]; 0 for none."""
     freeze_gc: bool = True
     """Move everything allocated so far out of the garbage collector's sight."""
 
