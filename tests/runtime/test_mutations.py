@@ -58,7 +58,7 @@ MUTANTS = (
     Mutant("time to collision", f"{R}/guard.py", "not ttc >= slow", "False", f"{F}/test_26_obstacle_moves_in.py"),
     Mutant("recoveries", "hiernav/nav/recovery.py", "stuck & (self._tries[rows] >= self.limit)", "stuck & False",
            f"{F}/test_28_pinned.py"),
-    Mutant("reach of a recovery", "hiernav/nav/recovery.py", "> self.reach_m]] = 0", "> 1e9]] = 0",
+    Mutant("reach of a recovery", "hiernav/nav/recovery.py", "> self.reach_m or", "> 1e9 or",
            f"{F}/test_28_pinned.py"),
     Mutant("hanging planner", f"{R}/process_planner.py", 'self._child.nudge(b"r")', "pass",
            f"{F}/test_09_planner_hangs.py::test_a_hanging_process_is_replaced_three_times_and_then_given_up"),
