@@ -42,7 +42,7 @@ from hiernav.runtime.policy import check_golden
 from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.robots import get_robot
 from hiernav.skill.networks import Actor
-from hiernav.skill.train import TorchSkill, load_actor, merit
+from hiernav.skill.train import TorchSkill, kept, load_actor
 
 OPSET = 18
 GOLDEN_SAMPLES = 32
@@ -203,14 +203,14 @@ def _fields(layout: ObservationLayout) -> tuple[ObservationField, ...]:
 
 
 def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
-    best = max(states["skill"]["evaluations"], key=merit)
+    skill = kept(states["skill"]["evaluations"], run.config.skill.eval_episodes)
     return {
         "hiernav": __version__,
         "torch": torch.__version__.split("+")[0],
         "seed": run.config.seed,
         "skill_steps": int(states["skill"]["steps"]),
         "skill_updates": int(states["skill"]["learner"]["updates"]),
-        "skill_reach_rate": float(best["reach_rate"]),
+        "skill_reach_rate": float(skill["reach_rate"]),
         "planner_samples": run.config.planner.samples,
         "planner_epochs": int(states["planner"]["epoch"]),
         "planner_error_m": round(float(states["planner"]["validation"].get("error", float("nan"))), 5),

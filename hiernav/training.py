@@ -57,8 +57,8 @@ def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
         _say_resumed(progress, run, "skill", f"step {steps:,} of {run.config.skill.total_steps:,}")
     began = time.perf_counter()
     skill.train(_SkillDisplay(progress))
-    best = max(skill.evaluations, key=skill_train.merit)
-    run.summarize({"skill": {**best, "seconds": round(time.perf_counter() - began, 1)}})
+    shipped = skill_train.kept(skill.evaluations, run.config.skill.eval_episodes)
+    run.summarize({"skill": {**shipped, "seconds": round(time.perf_counter() - began, 1)}})
 
 
 def _say_resumed(progress: Progress, run: Run, stage: str, done: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 
@@ -102,6 +102,22 @@ def alpha_floor(skill: SkillConfig, steps: int) -> float:
 def merit(evaluation: dict[str, float]) -> tuple[float, float]:
     """What makes one evaluation better than another: reach rate less a hundredth per collision, then fewer steps."""
     return evaluation["reach_rate"] - 0.01 * evaluation["collisions_mean"], -evaluation["steps_mean"]
+
+
+def kept(evaluations: Sequence[dict[str, float]], episodes: int) -> dict[str, float]:
+    """The evaluation of the actor that a training leaves: the last that is not worse by more than chance explains.
+
+    That is two standard errors of a difference of reach rates, of `episodes` each. Taking whichever evaluation is the
+    highest would take the luckiest instead, and give away what was learned after it.
+    """
+    chosen = best = evaluations[0]
+    for evaluation in evaluations[1:]:
+        rate = 0.5 * (evaluation["reach_rate"] + best["reach_rate"])
+        chance = 2.0 * (2.0 * rate * (1.0 - rate) / episodes) ** 0.5
+        if merit(evaluation)[0] >= merit(best)[0] - chance:
+            chosen = evaluation
+        best = max(best, evaluation, key=merit)
+    return chosen
 
 
 class TorchSkill:
@@ -295,9 +311,9 @@ class SkillTrainer:
             "return_mean": float(np.mean([e.return_ for e in episodes])),
         }
 
-        if all(merit(result) >= merit(earlier) for earlier in self.evaluations):
-            self.best_actor = {key: value.clone() for key, value in self.learner.average.state_dict().items()}
         self.evaluations.append(result)
+        if kept(self.evaluations, skill.eval_episodes) is result:
+            self.best_actor = {key: value.clone() for key, value in self.learner.average.state_dict().items()}
         self.run.log("evaluation", self.steps, {k: v for k, v in result.items() if k != "step"})
 
     def _save(self) -> None:

@@ -16,7 +16,7 @@ pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
 from hiernav.run import Run, RunError  # noqa: E402
 from hiernav.skill import train as skill_train  # noqa: E402
-from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, load_actor  # noqa: E402
+from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, kept, load_actor  # noqa: E402
 
 pytestmark = pytest.mark.train
 
@@ -112,6 +112,31 @@ def test_the_replay_is_on_disk_while_it_is_needed(straight, interrupted):
     # 768 transitions and a batch of simulations, two observations of 42 float32 each
     assert sum(replay.values()) > 776 * 2 * 42 * 4
     assert not (folder / "skill" / "replay").exists() and not (straight.run.path / "skill" / "replay").exists()
+
+
+def evaluations(*rates):
+    return [{"step": k, "reach_rate": r, "collisions_mean": 0.0, "steps_mean": 50.0} for k, r in enumerate(rates)]
+
+
+@pytest.mark.parametrize(
+    ("rates", "step"),
+    [
+        ((0.5,), 0),
+        ((0.5, 0.9), 1),
+        ((0.9, 0.5), 0),
+        ((0.99, 0.98), 1),  # as good as the best, and trained for longer
+        ((0.99, 0.90, 0.97), 2),
+        ((0.99, 0.97, 0.92), 1),  # no slow decline: the best is what counts
+        ((0.0, 0.0), 1),
+    ],
+)
+def test_the_last_actor_is_kept_unless_it_is_worse_by_more_than_chance(rates, step):
+    assert kept(evaluations(*rates), 100)["step"] == step
+
+
+def test_more_episodes_leave_less_to_chance():
+    assert kept(evaluations(0.99, 0.97), 100)["step"] == 1
+    assert kept(evaluations(0.99, 0.97), 1000)["step"] == 0
 
 
 def test_the_best_actor_is_what_a_run_leaves(straight):
