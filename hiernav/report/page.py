@@ -168,9 +168,8 @@ def _films(book: Book, beside: Path) -> str:
                 (f'<p class="short">failed: {escape(r.error or "")}</p>', f"{robot}, {world}") for r in group.failed
             ]
     return (
-        "<p>The first episode of the strict protocol in each world, from above, twice as fast as it is.</p>"
-        + _gallery(shown, "films")
-        + _command("--only films")
+        "<p>The first episode of the strict protocol in each world, from above, three times as fast as it is; a tap "
+        "plays and stops it.</p>" + _gallery(shown, "films") + _command("--only films")
     )
 
 
@@ -187,7 +186,8 @@ def _film(path: Path, beside: Path) -> str | None:
     data = f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
     if path.suffix == ".gif":
         return f'<img alt="{escape(path.stem)}" src="{data}">'
-    return f'<video controls muted loop playsinline preload="metadata" src="{data}"></video>'
+    play = "this.paused?this.play():this.pause()"
+    return f'<video muted loop playsinline preload="metadata" onclick="{play}" src="{data}"></video>'
 
 
 def _provenance(book: Book) -> str:
@@ -279,7 +279,7 @@ small{color:var(--soft);font-weight:400}
 li{max-width:46rem}
 .figures,.films{display:grid;gap:1rem;grid-template-columns:repeat(auto-fill,minmax(min(20rem,100%),1fr))}
 .films{grid-template-columns:repeat(auto-fill,minmax(min(13rem,45%),1fr))}
-figure{margin:0}figure svg,figure img,figure video{width:100%;height:auto;display:block}
+figure{margin:0}video{cursor:pointer}figure svg,figure img,figure video{width:100%;height:auto;display:block}
 svg text{font-family:system-ui,sans-serif!important}
 figcaption{color:var(--soft);font-size:.85rem}
 .cmd{overflow-x:auto}

@@ -38,7 +38,7 @@ SEEDS = {"point": 5, "car": 5, "doggo": 3}
 ABLATION_SEEDS = TABLE2_SEEDS = 3
 PERIODS = (4, 16, 64)
 
-FILM = {"episodes": 1, "size": 220, "speed": 2.0, "fps": 8.0}
+FILM = {"episodes": 1, "size": 400, "speed": 3.0, "fps": 6.0}
 """Small enough for a page of eighteen."""
 
 SKILL_SECONDS = {"point": 600.0, "car": 900.0, "doggo": 2400.0}
