@@ -8,7 +8,7 @@ import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -101,6 +101,23 @@ def drive_of(result: Result, protocol: str = "strict") -> Drive | None:
         raise ResultError(f"result {result.id}: metrics.{protocol}: {error}") from None
 
 
+class Walks(msgspec.Struct, frozen=True):
+    """What an entry of Table II holds at least."""
+
+    samples: int
+    collisions_mean: float
+
+
+class Film(msgspec.Struct, frozen=True):
+    """What a film's result holds."""
+
+    file: Annotated[str, msgspec.Meta(pattern=r"^[^/]+$")]
+    """In the folder of the results of films."""
+    bytes: int
+    reached: int
+    """Episodes in which the robot reaches its goal."""
+
+
 def result_path(folder: Path, cell: str) -> Path:
     """File of a cell ("experiment/name")."""
     return folder / f"{cell}.json"
@@ -136,10 +153,10 @@ def read_result(folder: Path, cell: str) -> Result | None:
         raise ResultError(f"{path}: holds the result of {result.id}")
     if (result.state == "failed") != (result.error is not None):
         raise ResultError(f"{path}: state {result.state!r} with error {result.error!r}")
-    for protocol in ("strict", "paper"):
+    if result.state == "done":
         try:
-            drive_of(result, protocol)
-        except ResultError as error:
+            _check_contents(result)
+        except (ResultError, msgspec.ValidationError) as error:
             raise ResultError(f"{path}: {error}") from None
     return result
 
@@ -156,6 +173,19 @@ def read_results(folder: Path) -> tuple[list[Result], list[str]]:
             if result is not None:
                 results.append(result)
     return results, damaged
+
+
+def _check_contents(result: Result) -> None:
+    """Raise if what the experiment is about is missing."""
+    if result.experiment == "table2":
+        msgspec.convert(result.metrics, Walks)
+    elif result.experiment == "films":
+        msgspec.convert(result.metrics, Film)
+    elif result.experiment != "planners" and drive_of(result) is None:
+        raise ResultError(f"result {result.id}: no metrics.strict")
+    drive_of(result, "paper")
+    if any(point.get("step") is None for points in result.curves.values() for point in points):
+        raise ResultError(f"result {result.id}: a point of a curve has no step")
 
 
 def this_machine() -> Machine:

@@ -157,6 +157,8 @@ def test_two_queues_do_not_work_on_the_same_cell(places):
         (lambda text: text.replace('"state": "done"', '"state": "failed"'), "state 'failed' with error None"),
         (lambda text: text.replace('"steps_mean": 50.0', '"steps_mean": "few"'), "metrics.strict"),
         (lambda text: text.replace('"endings"', '"ends"'), "metrics.strict"),
+        (lambda text: text.replace('"strict"', '"lax"'), "no metrics.strict"),
+        (lambda text: text.replace('"curves": {}', '"curves": {"evaluation": [{"reach_rate": 1.0}]}'), "has no step"),
         (lambda text: text.replace('"cell": "a"', '"cell": "b"'), "holds the result of astar/b"),
     ],
 )
@@ -180,10 +182,11 @@ def test_a_damaged_result_is_named_and_neither_used_nor_overwritten(places, dama
 
 def test_numbers_that_are_not_finite_are_written_as_unknown(places):
     nothing = float("nan")
-    Queue([cell("a")], places, lambda *_: Outcome({"error": nothing}, {}, {}, {"c": [{"x": nothing}]})).run()
-    result = read_result(places.results, "astar/a")
-    assert result.metrics == {"error": None} and result.curves == {"c": [{"x": None}]}
-    json.loads(result_path(places.results, "astar/a").read_text(), parse_constant=pytest.fail)
+    work = Outcome({"error": nothing}, {}, {}, {"c": [{"step": 1.0, "x": nothing}]})
+    Queue([cell("a", experiment="planners")], places, lambda *_: work).run()
+    result = read_result(places.results, "planners/a")
+    assert result.metrics == {"error": None} and result.curves == {"c": [{"step": 1.0, "x": None}]}
+    json.loads(result_path(places.results, "planners/a").read_text(), parse_constant=pytest.fail)
 
 
 @pytest.mark.parametrize("size", [FULL, SMOKE], ids=["full", "smoke"])
