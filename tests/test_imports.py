@@ -34,7 +34,7 @@ ALLOWED = {
     "draw": {"nav", "sim"},
     "film": {"nav", "sim", "evaluate", "draw"},
     "reproduce": {"nav", "sim", "planner", "evaluate", "finetune", "training", "film", "config", "run"},
-    "report": {"evaluate", "reproduce", "run"},
+    "report": {"evaluate", "reproduce", "run", "sim"},
     "cli": {
         "nav",
         "sim",

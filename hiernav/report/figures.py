@@ -127,7 +127,7 @@ def reach(book: Book, robot: str) -> str | None:
                 axes.plot(best, place, "|", color=PAPER, markersize=20, markeredgewidth=2, label=known)
         axes.axvline(0.97, color=PAPER, linewidth=0.8, linestyle=":")
         axes.set(yticks=range(len(WORLDS)), yticklabels=WORLDS, xlabel="reach rate, strict protocol", title=robot)
-        axes.invert_yaxis()
+        axes.set_ylim(len(WORLDS) - 0.5, -0.5)
         axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.16), ncols=2)
 
     return _svg(f"reach-{robot}", draw, f"Reach rates of the {robot}", height=3.6)

@@ -38,10 +38,10 @@ WHAT = {
 
 def table3(book: Book, robot: str, name: str) -> str:
     """The paper's Table III and ours, under the paper's protocol."""
-    columns = [
-        ("baseline", "the paper", None), ("baseline", "ours", "baseline"), ("ours", "the paper", None),
-        ("ours", "shipped", "shipped"), ("ours", "trained", "ours"), ("finetuned", "the paper", None),
-        ("finetuned", "shipped", "shipped-finetuned"), ("finetuned", "trained", "finetuned"),
+    columns = [  # ours first: a narrow screen shows few
+        ("ours", "the paper", None), ("ours", "shipped", "shipped"), ("ours", "trained", "ours"),
+        ("finetuned", "the paper", None), ("finetuned", "shipped", "shipped-finetuned"),
+        ("finetuned", "trained", "finetuned"), ("baseline", "the paper", None), ("baseline", "ours", "baseline"),
     ]  # fmt: skip
     if robot != paper.TABLE3_ROBOT:
         columns = [column for column in columns if column[2] is not None]
