@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
-from hiernav.runtime.tilt import TiltFilter, Vector, dot, level_axes
+from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
 __all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
 
@@ -20,6 +21,19 @@ ABSURD = 1e6
 """No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
+
+
+class _Accuracy(NamedTuple):
+    """Of a mean angular velocity, and what it makes of the accelerometer."""
+
+    walk: float
+    """Error of the rate [rad/s]."""
+    accelerometer_sigma: tuple[float, float]
+    """As in `TiltFilter.correct`; where the turn is known, the accelerometer of a body that shakes is no help."""
+
+
+_SAMPLED = _Accuracy(0.3, (0.3, 3.0))
+_INTEGRATED = _Accuracy(0.05, (1.0, 10.0))
 
 
 class Estimator:
@@ -49,15 +63,14 @@ class Estimator:
         self._filter.replace((BIAS,), (0.0,), config.bias_sigma**2)
         self._tilt = TiltFilter(
             dip_sine=config.magnetic_field[2] / self._field,
-            gyro_walk=0.3,
             magnetometer_sigma=max(1.5 * config.magnetometer_sigma / self._field, 0.01),
-            accelerometer_sigma=(0.3, 3.0),
         )
         self._stamp = -math.inf
         self._step = 0.0
         self._fix_stamp = -math.inf
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._yaw_rate = 0.0
+        self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
         self._rejected: Counter[str] = Counter()
         self._last_miss: dict[str, tuple[float, ...]] = {}
@@ -84,7 +97,8 @@ class Estimator:
         if self._accept_stamp(float(frame.stamp)):
             readings = {name: self._read(name, getattr(frame, name)) for name in VECTOR_SENSORS}
             field = self._trusted_field(readings["magnetometer"])
-            self._predict(readings["gyro"], readings["accelerometer"], field)
+            turn = self._turn(frame.rotation)
+            self._predict(readings["gyro"], turn, readings["accelerometer"], field)
             forward, left = level_axes(self._tilt.up)
             self._correct_yaw(field, forward, left)
             self._correct_velocity(readings["velocimeter"], forward, left)
@@ -113,18 +127,33 @@ class Estimator:
         self._stamp = stamp
         return True
 
-    def _predict(self, gyro: Vector | None, accelerometer: Vector | None, field: Vector | None) -> None:
+    def _turn(self, rotation: np.ndarray | None) -> Vector | None:
+        """How the body has turned since the last frame (rotation vector, body frame [rad]), if both say it."""
+        before, self._rotation = self._rotation, _quaternion(rotation)
+        if before is None or self._rotation is None:
+            return None
+        return rotation_between(before, self._rotation)
+
+    def _predict(
+        self, gyro: Vector | None, turn: Vector | None, accelerometer: Vector | None, field: Vector | None
+    ) -> None:
         """Bring tilt, heading and position to the new stamp."""
         config = self.config
         dt, first = self._step, self._step == 0.0
         rate, change = self._measured_rate(gyro)
         if first:
             self._rate = rate
-        mean = _mean(self._rate, rate)
+        mean, accuracy = _mean(self._rate, rate), _SAMPLED
+        if turn is not None and gyro is not None and dt > 0.0:
+            integrated = (turn[0] / dt, turn[1] / dt, turn[2] / dt)
+            if math.dist(integrated, gyro) <= 2.0 * config.max_jump:
+                mean, change, accuracy = integrated, 0.0, _INTEGRATED
+            else:
+                self.counts["rotation_rejected"] += 1
         if config.tilts:
             if dt > 0.0:
-                self._tilt.predict(dt, mean, change)
-            self._tilt.correct(field, accelerometer, self._gate_1)
+                self._tilt.predict(dt, mean, dt * math.hypot(accuracy.walk, 0.5 * change))
+            self._tilt.correct(field, accelerometer, accuracy.accelerometer_sigma, self._gate_1)
         _, uy, uz = self._tilt.up
         # Of the body rates, what turns the heading: Euler's kinematic equation for yaw, in terms of `up`.
         level = max(uy * uy + uz * uz, 1e-2)
@@ -292,6 +321,13 @@ class Estimator:
             why=why,
             restarts=self._restarts,
         )
+
+
+def _quaternion(value: np.ndarray | None) -> Quaternion | None:
+    parts = _components(value, 4)
+    if parts is None or not abs(math.fsum(part * part for part in parts) - 1.0) < 1e-3:
+        return None
+    return parts[0], parts[1], parts[2], parts[3]
 
 
 def _vector(value: np.ndarray | None) -> Vector | None:

@@ -46,6 +46,7 @@ class Sensors(Message, frozen=True):
     extra: dict[str, Numbers]
     position_fix: Numbers | None
     fix_stamp: Number | None
+    rotation: Numbers | None = None
 
 
 class State(Message, frozen=True):
@@ -324,14 +325,17 @@ def schema(kind: type[Message]) -> bytes:
     return msgspec.json.encode({"title": kind.__name__, **components[kind.__name__]})
 
 
+_READINGS = (*VECTOR_SENSORS, "lidar", "position_fix", "rotation")
+
+
 def _sensors(frame: SensorFrame) -> Sensors:
-    readings = {name: _numbers(getattr(frame, name)) for name in (*VECTOR_SENSORS, "lidar", "position_fix")}
+    readings = {name: _numbers(getattr(frame, name)) for name in _READINGS}
     extra: Mapping[str, Any] = {name: _numbers(value) for name, value in frame.extra.items()}
     return Sensors(stamp=_number(frame.stamp), extra=dict(extra), fix_stamp=_number(frame.fix_stamp), **readings)
 
 
 def _frame(message: Sensors) -> SensorFrame:
-    readings = {name: _array(getattr(message, name)) for name in (*VECTOR_SENSORS, "lidar", "position_fix")}
+    readings = {name: _array(getattr(message, name)) for name in _READINGS}
     extra = {name: _array(value) for name, value in message.extra.items()}
     return SensorFrame(_float(message.stamp), extra=extra, fix_stamp=_float(message.fix_stamp), **readings)
 

@@ -34,6 +34,10 @@ class SensorFrame:
     """(2,) position of the body origin in the world frame [m]."""
     fix_stamp: float | None = None
     """When the position was measured, on the same clock; `stamp` if None [s]."""
+    rotation: np.ndarray | None = None
+    """(4,) unit quaternion w, x, y, z: the angular velocity as the inertial unit integrates it by itself, at its own
+    rate, from any start. Its change from frame to frame counts alone, so that it may drift. A body that shakes within a
+    control period cannot do without: samples of `gyro` do not tell where it turned meanwhile."""
 
     def terms(self) -> dict[str, np.ndarray]:
         """Every observation term that this frame has, by name, 1-D each."""

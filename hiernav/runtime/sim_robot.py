@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from hiernav.nav.lidar import lidar_closeness
@@ -92,6 +93,8 @@ class SimRobot:
         self._pending: deque[tuple[float, float, np.ndarray]] = deque()
         self._next_fix = 0.0
         self._frame: SensorFrame | None = None
+        self._drift = np.random.default_rng(np.random.SeedSequence([seed, 0x7042]))
+        self._before, self._sensed = self._sim.orientation()[0], np.array([1.0, 0.0, 0.0, 0.0])
 
     def restart(self, seed: int) -> None:
         """Start anew in another world of the same kind, with the noise of `seed`."""
@@ -146,6 +149,7 @@ class SimRobot:
     def _step(self, action: np.ndarray) -> None:
         self._held = action
         self._sim.step(action[None])
+        self._integrate()
         self._collisions += int(self._sim.collided[0])
         self._frame = None
 
@@ -181,7 +185,20 @@ class SimRobot:
             extra=extra,
             position_fix=fix,
             fix_stamp=fix_stamp,
+            rotation=self._sensed,
         )
+
+    def _integrate(self) -> None:
+        """Have the inertial unit turn as the body has in the last step, but for its gyro's bias and noise."""
+        after, noise, count = self._sim.orientation()[0], self.noise, self.spec.substeps
+        if not np.isfinite(after).all():
+            return
+        turn = np.zeros(3)
+        mujoco.mju_subQuat(turn, after, self._before)
+        # of as many samples as there are physics steps
+        turn += self.control_period * (noise.gyro_bias + noise.gyro / np.sqrt(count) * self._drift.standard_normal(3))
+        self._before, self._sensed = after, self._sensed.copy()
+        mujoco.mju_quatIntegrate(self._sensed, turn, 1.0)
 
     def _sense_position(self, now: float) -> tuple[np.ndarray | None, float | None]:
         noise = self.noise

@@ -7,6 +7,8 @@ import math
 GRAVITY = 9.81
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""w, x, y, z"""
 
 
 class TiltFilter:
@@ -20,20 +22,14 @@ class TiltFilter:
     stay uncorrelated and two variances are the whole covariance.
     """
 
-    def __init__(
-        self, dip_sine: float, gyro_walk: float, magnetometer_sigma: float, accelerometer_sigma: tuple[float, float]
-    ) -> None:
+    def __init__(self, dip_sine: float, magnetometer_sigma: float) -> None:
         """
         Args:
             dip_sine: z component of the unit vector along the world's magnetic field.
-            gyro_walk: error of the integrated gyro [rad/s over one interval].
             magnetometer_sigma: of the field's direction [rad].
-            accelerometer_sigma: of the direction of gravity [rad] at a reading of g, and its growth per g of excess.
         """
         self._dip_sine = dip_sine
-        self._gyro_walk = gyro_walk
         self._magnetometer_variance = magnetometer_sigma**2
-        self._accelerometer_sigma = accelerometer_sigma
         self.reset()
 
     def reset(self) -> None:
@@ -46,8 +42,8 @@ class TiltFilter:
         """Uncertainty of the direction, mean of its two components [rad]."""
         return math.sqrt(0.5 * (self._along + self._across))
 
-    def predict(self, dt: float, rate: Vector, change: float) -> None:
-        """Turn by the mean body rate [rad/s] over `dt` [s], within which the rate changed by `change` [rad/s]."""
+    def predict(self, dt: float, rate: Vector, sigma: float) -> None:
+        """Turn by the mean body rate [rad/s] over `dt` [s]; `sigma` is the uncertainty of that turn [rad]."""
         turn = (-rate[0] * dt, -rate[1] * dt, -rate[2] * dt)
         angle = math.sqrt(dot(turn, turn))
         if angle > 1e-9:
@@ -61,12 +57,24 @@ class TiltFilter:
                 uy + first * once[1] + second * twice[1],
                 uz + first * once[2] + second * twice[2],
             )
-        variance = (self._gyro_walk * dt) ** 2 + (0.5 * change * dt) ** 2
-        self._along = min(self._along + variance, 1.0)
-        self._across = min(self._across + variance, 1.0)
+        self._along = min(self._along + sigma**2, 1.0)
+        self._across = min(self._across + sigma**2, 1.0)
 
-    def correct(self, magnetometer: Vector | None, accelerometer: Vector | None, gate: float) -> None:
-        """Pull towards what the sensors say; a magnetometer beyond `gate` (squared Mahalanobis distance) is ignored."""
+    def correct(
+        self,
+        magnetometer: Vector | None,
+        accelerometer: Vector | None,
+        accelerometer_sigma: tuple[float, float],
+        gate: float,
+    ) -> None:
+        """Pull towards what the sensors say.
+
+        Args:
+            magnetometer: one beyond `gate` (squared Mahalanobis distance) is ignored.
+            accelerometer: [m/s^2].
+            accelerometer_sigma: of the direction of gravity [rad] at a reading of g, and its growth per g of excess.
+            gate: see there.
+        """
         along = None
         if magnetometer is not None:
             along = self._correct_field(magnetometer, gate)
@@ -75,7 +83,7 @@ class TiltFilter:
             self._along = self._across = 0.5 * (self._along + self._across)
             along = level_axes(self.up)[0]
         if accelerometer is not None:
-            self._correct_gravity(accelerometer, along)
+            self._correct_gravity(accelerometer, accelerometer_sigma, along)
 
     def _correct_field(self, field: Vector, gate: float) -> Vector | None:
         """Returns the level direction along the field; None if the field is of no use."""
@@ -95,11 +103,11 @@ class TiltFilter:
             self._along *= 1.0 - gain * level
         return along
 
-    def _correct_gravity(self, force: Vector, along: Vector) -> None:
+    def _correct_gravity(self, force: Vector, sigma: tuple[float, float], along: Vector) -> None:
         length = math.sqrt(dot(force, force))
         if length < 1e-9:
             return
-        base, growth = self._accelerometer_sigma
+        base, growth = sigma
         variance = (base + growth * abs(length / GRAVITY - 1.0)) ** 2
         across = cross(self.up, along)
         gain_along = self._along / (self._along + variance)
@@ -127,6 +135,19 @@ def level_axes(up: Vector) -> tuple[Vector, Vector]:
     """
     _, forward = _levelled((1.0, 0.0, 0.0), up, up[0])
     return forward, cross(up, forward)
+
+
+def rotation_between(before: Quaternion, after: Quaternion) -> Vector:
+    """The rotation vector [rad] that leads from one orientation to another, in the body's frame; at most pi long."""
+    w, x, y, z = before
+    a, b, c, d = after
+    real = w * a + x * b + y * c + z * d
+    first, second, third = w * b - x * a - y * d + z * c, w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a
+    half = math.sqrt(first * first + second * second + third * third)
+    if half < 1e-12:
+        return 0.0, 0.0, 0.0
+    scale = 2.0 * math.atan2(math.copysign(half, real), abs(real)) / half
+    return scale * first, scale * second, scale * third
 
 
 def dot(a: Vector, b: Vector) -> float:

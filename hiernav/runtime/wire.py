@@ -21,6 +21,7 @@ class _Frame(msgspec.Struct, array_like=True):
     extra: dict[str, list[float]]
     position_fix: list[float] | None
     fix_stamp: float | None
+    rotation: list[float] | None
     truth: tuple[float, list[float], list[float], float, bool, int] | None
 
 
@@ -41,6 +42,7 @@ def encode_frame(frame: SensorFrame, truth: Truth | None) -> bytes:
             {name: np.asarray(value, np.float64).ravel().tolist() for name, value in frame.extra.items()},
             _list(frame.position_fix),
             None if frame.fix_stamp is None else float(frame.fix_stamp),
+            _list(frame.rotation),
             None
             if truth is None
             else (
@@ -72,6 +74,7 @@ def decode_frame(message: bytes) -> tuple[SensorFrame, Truth | None]:
         {name: np.array(value) for name, value in m.extra.items()},
         _array(m.position_fix),
         m.fix_stamp,
+        _array(m.rotation),
     )
     if m.truth is None:
         return frame, None

@@ -130,6 +130,10 @@ class BatchSim:
         total, floor, own = (history[:, columns] for columns in self._contact_columns)
         self.collided = (total > floor + own).any(axis=1) & self.finite
 
+    def orientation(self) -> np.ndarray:
+        """(N, 4) unit quaternions w, x, y, z from the body's frame to the world's, of the present state."""
+        return self.robot.orientation(np.array([data.qpos for data in self.datas]))
+
     def close(self) -> None:
         """Stop the worker threads. The simulations cannot be stepped afterwards."""
         if self._workers is not None:

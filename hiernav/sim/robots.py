@@ -86,6 +86,13 @@ class RobotSpec:
         pose[:, 2] = wrap_angle(np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)))
         return pose
 
+    def orientation(self, qpos: np.ndarray) -> np.ndarray:
+        """(N, nq) -> (N, 4) unit quaternions w, x, y, z from the body's frame to the world's."""
+        if self.free_base:
+            return qpos[:, 3:7].copy()
+        half, zero = 0.5 * qpos[:, 2], np.zeros(len(qpos))
+        return np.column_stack([np.cos(half), zero, zero, np.sin(half)])
+
     def upright(self, qpos: np.ndarray) -> np.ndarray:
         """(N, nq) -> (N,) z component of the body's z axis: 1 upright, -1 on its back."""
         if not self.free_base:

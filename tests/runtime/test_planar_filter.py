@@ -154,17 +154,17 @@ def test_a_body_whose_nose_points_straight_up_still_gets_axes():
 
 
 def test_up_follows_the_gyro_through_a_roll():
-    tilt = TiltFilter(0.0, 0.3, 0.03, (0.3, 3.0))
+    tilt = TiltFilter(0.0, 0.03)
     for _ in range(100):
         tilt.predict(0.01, (0.8, 0.0, 0.0), 0.0)
     np.testing.assert_allclose(tilt.up, turned(0.8, 0.0), atol=1e-9)
 
 
 def test_up_is_found_from_gravity_alone():
-    tilt = TiltFilter(0.0, 0.3, 0.03, (0.3, 3.0))
+    tilt = TiltFilter(0.0, 0.03)
     up = turned(0.3, -0.4)
     for _ in range(300):
-        tilt.predict(0.02, (0.0, 0.0, 0.0), 0.0)
-        tilt.correct(None, tuple(9.81 * component for component in up), gate=12.0)
+        tilt.predict(0.02, (0.0, 0.0, 0.0), 0.006)
+        tilt.correct(None, tuple(9.81 * component for component in up), (0.3, 3.0), gate=12.0)
     np.testing.assert_allclose(tilt.up, up, atol=1e-3)
     assert tilt.sigma < 0.1
