@@ -199,9 +199,10 @@ def this_machine() -> Machine:
     return Machine(cpu=_cpu(), cores=_cores(), system=f"{platform.system()} {platform.machine()}", versions=versions)
 
 
-def git_state(root: Path, ignored: Path) -> tuple[str | None, bool | None]:
-    """Commit of a repository and whether tracked files outside `ignored` differ from it; None and None without git."""
-    excluded = [f":(exclude){ignored.relative_to(root)}"] if ignored.is_relative_to(root) else []
+def git_state(root: Path, results: Path) -> tuple[str | None, bool | None]:
+    """Commit of a repository and whether tracked files differ from it, results apart; None and None without git."""
+    folders = {root / "results", results}
+    excluded = [f":(exclude){folder.relative_to(root)}" for folder in folders if folder.is_relative_to(root)]
     try:
         commit = _git(root, "rev-parse", "HEAD").strip()
         changes = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *excluded)

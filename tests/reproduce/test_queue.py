@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
+import subprocess
 from pathlib import Path
 
 import msgspec
@@ -14,7 +15,7 @@ from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
-from hiernav.reproduce.results import ResultError, read_result, read_results, result_path
+from hiernav.reproduce.results import ResultError, git_state, read_result, read_results, result_path
 from hiernav.reproduce.work import Outcome
 
 ROOT = Path(__file__).parents[2]
@@ -96,6 +97,25 @@ def test_no_cell_is_started_that_does_not_fit_into_the_budget(places):
     assert list(tally.skipped) == ["astar/long"]
     assert tally.skipped["astar/long"].startswith(f"takes about {duration(1e6)}")
     assert read_result(places.results, "astar/long") is None
+
+
+def test_a_result_knows_its_commit_and_whether_code_was_changed(places):
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(places.root), "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    assert git_state(places.root, places.results) == (None, None)
+    (places.root / "results").mkdir()
+    for name in ("code.py", "results/a.json"):
+        (places.root / name).write_text("1")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "x")
+    (places.root / "results/a.json").write_text("2")
+    (places.root / "new.py").write_text("2")
+    assert git_state(places.root, places.root / "elsewhere") == (git("rev-parse", "HEAD"), False)
+    (places.root / "code.py").write_text("2")
+    assert git_state(places.root, places.results) == (git("rev-parse", "HEAD"), True)
 
 
 def test_estimates_follow_what_cells_of_a_kind_took(places):
