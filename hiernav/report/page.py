@@ -9,6 +9,8 @@ from collections.abc import Callable
 from html import escape
 from pathlib import Path
 
+import cv2
+
 from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
@@ -186,8 +188,22 @@ def _film(path: Path, beside: Path) -> str | None:
     data = f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
     if path.suffix == ".gif":
         return f'<img alt="{escape(path.stem)}" src="{data}">'
+    poster = _last_frame(path)
     play = "this.paused?this.play():this.pause()"
-    return f'<video muted loop playsinline preload="metadata" onclick="{play}" src="{data}"></video>'
+    return f'<video muted loop playsinline preload="none" onclick="{play}" poster="{poster}" src="{data}"></video>'
+
+
+def _last_frame(path: Path) -> str:
+    """How a film ends, the whole way in it, as the picture that stands for it; empty if it cannot be decoded."""
+    video, last = cv2.VideoCapture(str(path)), None
+    while (read := video.read())[0]:
+        last = read[1]
+    video.release()
+    if last is None:
+        return ""
+    small = cv2.resize(last, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 50])
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
 def _provenance(book: Book) -> str:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import math
 import re
 from pathlib import Path
 
+import cv2
 import made_up
 import msgspec
+import numpy as np
 import pytest
 
 from hiernav import cli
@@ -16,7 +19,7 @@ from hiernav.film.film import film_name
 from hiernav.report import findings as told
 from hiernav.report import paper, tables
 from hiernav.report.book import Book, of_seeds
-from hiernav.report.page import FILM_LIMIT, render, write_report
+from hiernav.report.page import FILM_LIMIT, _film, render, write_report
 from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
@@ -158,6 +161,14 @@ def test_small_films_are_in_the_page_and_large_ones_are_links(results, tmp_path)
     page = render(Book.open(folder), tmp_path)
     assert 'src="data:image/gif;base64,R0dH' in page
     assert f'href="results/films/{cells[1].name}.gif"' in page
+
+
+def test_a_film_is_stood_for_by_its_end_until_it_is_played():
+    films = sorted((made_up.ROOT / "results" / "films").glob("*.mp4"))
+    shown = _film(films[0], made_up.ROOT)
+    poster = base64.b64decode(re.search(r'poster="data:image/jpeg;base64,([^"]+)"', shown)[1])
+    picture = cv2.imdecode(np.frombuffer(poster, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] > 200 and picture.std() > 10.0
 
 
 def test_a_damaged_result_is_named_on_the_page_and_by_the_command(results, tmp_path, capsys):
