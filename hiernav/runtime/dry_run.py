@@ -25,6 +25,7 @@ from hiernav.runtime.timing import Histogram
 
 WAKES = 200
 PERIOD = 0.005
+SENSORS = (*VECTOR_SENSORS, "lidar", "position_fix", "rotation")
 
 
 def report(
@@ -70,8 +71,8 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
 
 def _check_robot(robot: ProcessRobot) -> dict[str, Any]:
     frame = robot.read()
-    present = [name for name in (*VECTOR_SENSORS, "lidar", "position_fix") if getattr(frame, name) is not None]
-    absent = [name for name in (*VECTOR_SENSORS, "lidar", "position_fix") if name not in present]
+    present = [name for name in SENSORS if getattr(frame, name) is not None]
+    absent = [name for name in SENSORS if name not in present]
     broken = [name for name in present if not np.isfinite(getattr(frame, name)).all()]
     return {
         "control period": f"{1e3 * robot.control_period:g} ms",
