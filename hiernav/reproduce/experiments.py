@@ -60,6 +60,7 @@ TRAINING = {
     "no-average": ["skill.actor_average=0"],
     "no-alpha-floor": ["skill.alpha_floor=0"],
     "whole-episodes": ["skill.episode_steps=null"],
+    "no-tilt-cost": ["reward.tilt=0"],
     "go-on-after-fall": ["skill.end_on_fall=false"],
     "no-clock": ["skill.clock=false"],
     "layer-norm": ["skill.layer_norm=true"],
@@ -224,8 +225,8 @@ class _Maker:
         cells = []
         ours = self._config(0, [])
         for name, overrides in TRAINING.items():
-            cannot_fall = name == "go-on-after-fall" and not get_robot(self.robot).free_base
-            if cannot_fall or self._config(0, overrides) == ours:
+            about_falls = name in ("no-tilt-cost", "go-on-after-fall")
+            if (about_falls and not get_robot(self.robot).free_base) or self._config(0, overrides) == ours:
                 continue
             for seed in range(self.given_seeds or ABLATION_SEEDS):
                 cells.append(
