@@ -82,7 +82,10 @@ class FixedRateLoop:
         self._stopped = False
 
     def stop(self) -> None:
-        """Leave the loop after the present tick. May be called from any thread."""
+        """Leave the loop after the present tick; if it does not run, the next `run` ends before its first tick.
+
+        May be called from any thread.
+        """
         self._stopped = True
 
     def drop_preparation(self) -> None:
@@ -95,7 +98,7 @@ class FixedRateLoop:
         Raises:
             Exception: whatever `tick` raises, after the brake; or what `brake` raised at its last attempt.
         """
-        self._leaving, self._signalled, self._stopped = True, False, False
+        self._leaving, self._signalled = True, False
         exit_reason = LoopExit.DONE
         with self._signals():
             # Two levels: a signal in the few instructions before `_leaving` is set still finds a `finally` around it.
@@ -107,6 +110,7 @@ class FixedRateLoop:
                 finally:
                     self._leaving = True
             finally:
+                self._stopped = False  # not at the beginning: a stop that comes just before it must not be lost
                 self._brake_for_sure()
         return LoopExit.INTERRUPTED if self._signalled else exit_reason
 

@@ -193,6 +193,18 @@ def test_a_failing_clock_brakes_too():
     assert brakes.calls == 1
 
 
+def test_a_stop_that_comes_before_the_loop_runs_is_not_lost_and_stops_one_run_alone():
+    ticks, brakes = [], []
+    loop = FixedRateLoop(
+        FakeClock(), PERIOD, lambda now: ticks.append(now) or len(ticks) == 3, lambda: brakes.append(1)
+    )
+    loop.stop()
+    assert loop.run() is LoopExit.DONE
+    assert ticks == [] and len(brakes) == 1
+    loop.run()
+    assert len(ticks) == 3
+
+
 def test_stop_leaves_after_the_present_tick():
     ticks = []
 
