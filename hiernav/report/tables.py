@@ -30,8 +30,9 @@ WHAT = {
     "one-world": "trained in pillar(2,2,10) alone, as in the paper", "no-phase-in": "all worlds from the start",
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
     "no-alpha-floor": "no floor of the temperature", "whole-episodes": "training episodes run to the cap",
-    "go-on-after-fall": "training goes on after a fall", "no-clock": "no gait clock",
-    "layer-norm": "with layer normalisation in the critics", "learned-plans": "trained with the network's plans",
+    "no-tilt-cost": "no cost of tilting", "go-on-after-fall": "training goes on after a fall",
+    "no-clock": "no gait clock", "layer-norm": "with layer normalisation in the critics",
+    "learned-plans": "trained with the network's plans",
 }  # fmt: skip
 """Ablation -> what differs."""
 
