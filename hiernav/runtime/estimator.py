@@ -130,7 +130,8 @@ class Estimator:
     def _turn(self, rotation: np.ndarray | None) -> Vector | None:
         """How the body has turned since the last frame (rotation vector, body frame [rad]), if both say it."""
         before, self._rotation = self._rotation, _quaternion(rotation)
-        if before is None or self._rotation is None:
+        # One that stays the same to the bit is of a unit that hangs, or of a body that does not turn anyway.
+        if before is None or self._rotation is None or before == self._rotation:
             return None
         return rotation_between(before, self._rotation)
 

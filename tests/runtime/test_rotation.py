@@ -66,6 +66,14 @@ def test_a_rotation_that_jumps_is_not_followed() -> None:
     assert errors.max() < 45.0, "half a turn would be 180"
 
 
+def test_a_rotation_that_hangs_counts_as_none() -> None:
+    frames = shaken(60)
+    frozen = frames[0][0].rotation
+    hangs = tilt_errors([(replace(frame, rotation=frozen), upright) for frame, upright in frames])
+    none = tilt_errors([(replace(frame, rotation=None), upright) for frame, upright in frames])
+    np.testing.assert_array_equal(hangs, none)
+
+
 @pytest.mark.parametrize("garbage", [np.full(4, np.nan), np.zeros(4), np.full(4, 9.0), np.zeros(3)])
 def test_garbage_counts_as_no_rotation(garbage: np.ndarray) -> None:
     frames = shaken(40)
