@@ -62,7 +62,7 @@ class LocalBatches:
         per_batch = frames_of_batch(skill.num_envs, frames)
         collector = Collector(
             self._env,
-            exploring(self.policy, skill),
+            exploring(self.policy, skill, self.task.layout),
             frames_per_batch=per_batch,
             total_frames=max(1, frames // per_batch) * per_batch,
             init_random_frames=random_batches(self.config, steps, per_batch) * per_batch,

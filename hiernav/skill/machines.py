@@ -179,8 +179,9 @@ def make_env(config: TrainConfig, planner: Planner | None = None) -> NavigationE
 def make_acting_policy(config: TrainConfig) -> TensorDictModuleBase:
     """The policy of one worker, which waits for its weights."""
     action_dim = get_robot(config.robot).action_dim
-    actor = Actor(skill_layout(config), action_dim, config.skill.hidden, layer_norm=False)
-    return exploring(make_policy(actor, action_dim), config.skill)
+    layout = skill_layout(config)
+    actor = Actor(layout, action_dim, config.skill.hidden, layer_norm=False)
+    return exploring(make_policy(actor, action_dim), config.skill, layout)
 
 
 def _leave_interrupts_to_the_trainer() -> None:

@@ -51,29 +51,31 @@ warnings.filterwarnings("ignore", "No target network updater", UserWarning)
 _LEAST_ALPHA = 1e-8
 
 
-class PartlyGreedy(TensorDictModuleBase):
-    """A policy whose first rows act without noise.
+class PartlyBold(TensorDictModuleBase):
+    """A policy whose first rows take obstacles for farther away than they are.
 
-    They fill the replay buffer with the states that the exported, noiseless skill gets into and stays in, which the
-    noise of the others leads out of before anything can be learned there.
+    A skill that has run into things learns to stand still where its lidar reads much, and what it no longer tries there
+    it cannot learn to be sound. The bold rows try: the first sees no obstacles at all, the others the more the later
+    they come. They are stored with what the lidar truly read.
     """
 
     in_keys, out_keys = ["observation"], ["action"]
 
-    def __init__(self, policy: ProbabilisticActor, share: float) -> None:
+    def __init__(self, policy: ProbabilisticActor, share: float, lidar: slice) -> None:
         super().__init__()
-        self.policy, self.share = policy, share
+        self.policy, self.share, self.lidar = policy, share, lidar
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self.policy(tensordict)
-        greedy = round(self.share * len(tensordict))
-        action = torch.cat([torch.tanh(tensordict["loc"][:greedy]), tensordict["action"][greedy:]])
-        return tensordict.set("action", action)
+        observation = tensordict["observation"].clone()
+        bold = round(self.share * len(observation))
+        observation[:bold, self.lidar] *= torch.arange(bold)[:, None] / max(bold, 1)
+        acted = self.policy(TensorDict({"observation": observation}, tensordict.batch_size))
+        return tensordict.set("action", acted["action"])
 
 
-def exploring(policy: ProbabilisticActor, skill: SkillConfig) -> TensorDictModuleBase:
+def exploring(policy: ProbabilisticActor, skill: SkillConfig, layout: ObservationLayout) -> TensorDictModuleBase:
     """What acts in training, with the weights of `policy`; a new one for every segment."""
-    return PartlyGreedy(policy, skill.greedy_share)
+    return PartlyBold(policy, skill.bold_share, layout.slices["lidar"])
 
 
 class Learner:
