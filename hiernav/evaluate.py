@@ -1,4 +1,5 @@
-"""Evaluation of a pair of policies on any list of worlds, under the paper's protocol or the strict one.
+"""Evaluation of a pair of policies on any list of worlds, under the paper's protocol or the strict one; and of plans
+alone, which a disc walks along without physics.
 
 `paper`: 200 episodes; contacts with gremlins do not count as collisions.
 `strict`: 1000 episodes; every contact counts.
@@ -25,10 +26,13 @@ from hiernav.sim.factory import default_planner, expert_planner, make_task, skil
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes
+from hiernav.sim.walk import WalkResult, walk
 from hiernav.sim.worlds import sample_layout
 
 EPISODES = {"paper": 200, "strict": 1000}
 _Z95 = 1.959963984540054
+_WALKERS = 100
+"""Walks side by side."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,48 @@ def evaluate(
             "seconds": round(time.perf_counter() - began, 2),
         }
     return results
+
+
+def evaluate_plans(
+    policies: Policies,
+    world: WorldSpec,
+    planner: str = "cnn",
+    repair: bool = True,
+    episodes: int = 1000,
+    seed: int = 0,
+    on_episodes: Callable[[int], None] | None = None,
+) -> dict[str, Any]:
+    """Metrics of a disc of planning radius that walks along plans (`walk`), moving obstacles at rest.
+
+    Args:
+        planner: "cnn" or "astar".
+        repair: see `make_planner`.
+        on_episodes: called with how many are done.
+    """
+    plan, radius = make_planner(policies, planner, repair), expert_planner(policies.config).radius
+    seeds = np.random.SeedSequence((seed, 0x3A1C)).generate_state(episodes)
+    began, parts = time.perf_counter(), list[WalkResult]()
+    for first in range(0, episodes, _WALKERS):
+        layouts = [sample_layout(world, int(s), radius) for s in seeds[first : first + _WALKERS]]
+        parts.append(walk(plan, layouts, radius, max_plans=max(60, world.max_steps // 10)))
+        if on_episodes is not None:
+            on_episodes(min(first + _WALKERS, episodes))
+    collisions = np.concatenate([part.collisions for part in parts])
+    return {
+        "world": str(world),
+        "planner": planner,
+        "repair": repair,
+        "episodes": episodes,
+        "seed": seed,
+        "radius_m": radius,
+        "collisions_mean": float(collisions.mean()),
+        "collisions_total": int(collisions.sum()),
+        "collision_free_rate": float((collisions == 0).mean()),
+        "reach_rate": float(np.concatenate([part.reached for part in parts]).mean()),
+        "plans_mean": float(np.concatenate([part.plans for part in parts]).mean()),
+        **_plan_counts(plan),
+        "seconds": round(time.perf_counter() - began, 2),
+    }
 
 
 def under_protocol(episodes: Sequence[Episode], protocol: str, world: WorldSpec) -> list[Episode]:

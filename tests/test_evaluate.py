@@ -15,6 +15,7 @@ from hiernav.evaluate import (
     Policies,
     episode_seeds,
     evaluate,
+    evaluate_plans,
     make_planner,
     open_policies,
     summarize,
@@ -222,6 +223,18 @@ def test_the_network_plans_verified_or_alone(able_run: Path):
     assert checked["proposals"] >= checked["repairs"] > 0
     assert checked["proposals"] >= sum(checked["replans"].values()) - checked["replans"]["goal"]
     assert "proposals" not in alone
+
+
+@pytest.mark.train
+def test_plans_are_walked_along_verified_or_alone(able_run: Path):
+    policies, dense, told = open_policies(able_run), parse_world("pillar(1.5,1.5,8)"), []
+    checked = evaluate_plans(policies, dense, episodes=120, on_episodes=told.append)
+    alone, expert = (evaluate_plans(policies, dense, kind, False, episodes=120) for kind in ("cnn", "astar"))
+    assert told == [100, 120]
+    assert checked["collisions_total"] == expert["collisions_total"] == 0 < alone["collisions_total"]
+    assert checked["repairs"] > 0 and "repairs" not in alone
+    assert checked["reach_rate"] == expert["reach_rate"] == 1.0
+    assert alone["collisions_mean"] == alone["collisions_total"] / 120
 
 
 @pytest.mark.train

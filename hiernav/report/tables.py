@@ -8,7 +8,7 @@ from html import escape
 
 from hiernav.report import paper
 from hiernav.report.book import Book, Estimate, Group, of_seeds
-from hiernav.reproduce.experiments import DEPARTURE_WORLDS, DRIVING, PERIODS, ROBOTS, TRAINING, WORLDS
+from hiernav.reproduce.experiments import DEPARTURE_WORLDS, DRIVING, PERIODS, ROBOTS, TRAINING, UNSEEN, WORLDS
 
 NOT_RUN = '<span class="none">not run yet</span>'
 _DIGITS = {"reach_rate": 3, "steps_mean": 1, "collisions_mean": 2, "collision_free_rate": 3, "spl_mean": 3}
@@ -31,8 +31,8 @@ WHAT = {
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
     "no-alpha-floor": "no floor of the temperature", "whole-episodes": "training episodes run to the cap",
     "no-tilt-cost": "no cost of tilting", "go-on-after-fall": "training goes on after a fall",
-    "no-clock": "no gait clock", "layer-norm": "with layer normalisation in the critics",
-    "learned-plans": "trained with the network's plans",
+    "no-bold-rows": "no robot takes obstacles for farther away", "no-clock": "no gait clock",
+    "layer-norm": "with layer normalisation in the critics", "learned-plans": "trained with the network's plans",
 }  # fmt: skip
 """Ablation -> what differs."""
 
@@ -88,6 +88,31 @@ def table2(book: Book) -> str:
             row.append(_shown(of_seeds(values, 0.0), "collisions_mean", len(failed), printed, fewer=True))
         rows.append(row)
     return table(["the paper", "its network, ours", "our network"], rows, "samples")
+
+
+def walks(book: Book, robot: str) -> str:
+    """Plans alone: collisions and reach rate of a disc, whoever plans."""
+    rows = []
+    for world in (*WORLDS, *UNSEEN):
+        for result in book.group("walks", "shipped", robot, world).done:
+            found = result.metrics
+            row = [f"{escape(world)}{'' if world in WORLDS else ' <small>unseen</small>'}"]
+            row += [f"{found[name]['collisions_mean']:.3f}" for name in ("network", "verified")]
+            row += [f"{found[name]['reach_rate']:.3f}" for name in ("network", "verified", "astar")]
+            rows.append([*row, f"{100.0 * found['verified']['repairs'] / found['verified']['proposals']:.1f} %"])
+    heads = [f"{what}<br><small>{who}</small>" for what, who in (
+        ("collisions", "network"), ("collisions", "verified"), ("reach rate", "network"), ("reach rate", "verified"),
+        ("reach rate", "A*"), ("repaired", "of the plans"),
+    )]  # fmt: skip
+    return table(heads, rows, "world")
+
+
+def unseen(book: Book, robot: str) -> str:
+    """Drives of the shipped bundle in worlds of other sizes and densities."""
+    names = ("reach_rate", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean")
+    groups = [(world, book.group("unseen", "shipped", robot, world)) for world in UNSEEN]
+    rows = [[escape(world), *(cell(g, name) for name in names)] for world, g in groups if g.done or g.failed]
+    return table([_HEADS[name] for name in names], rows, "world")
 
 
 def replanning(book: Book, robot: str) -> str:

@@ -12,7 +12,7 @@ import msgspec
 
 from hiernav.nav.bundle import MANIFEST, PLANNER, SKILL, file_sha256
 
-Kind = Literal["evaluate", "train", "finetune", "table2", "film"]
+Kind = Literal["evaluate", "train", "finetune", "table2", "walk", "film"]
 TRAINING: frozenset[str] = frozenset({"train", "finetune", "table2"})
 """Kinds that train a network, and need the train extra."""
 

@@ -23,6 +23,8 @@ from hiernav.sim.robots import get_robot
 EXPERIMENTS = {
     "table3": "Table III: reach rate and steps in six worlds; baseline, ours, fine-tuned planner",
     "astar": "A* in the place of the learned planner (not in the paper)",
+    "walks": "plans alone, without physics, in the six worlds and in unseen ones (not in the paper)",
+    "unseen": "worlds of other sizes and densities than those of training (not in the paper)",
     "replanning": "fixed periods of 4, 16 and 64 steps against the rule",
     "ablations": "each departure from the paper switched off, or tried (not in the paper)",
     "films": "each robot in each world, from above",
@@ -32,6 +34,11 @@ EXPERIMENTS = {
 }
 ROBOTS = ("point", "car", "doggo")
 WORLDS = ("pillar(2,2,10)", "gremlin", "pillar(3,3,25)", "pillar(4,4,40)", "two-room", "four-room")
+UNSEEN = (
+    "pillar(2,2,5)", "pillar(2,2,15)", "gremlin(3,3,22)", "two-room(4,4)", "four-room(4,4)", "pillar(6,6,93)",
+    "pillar(8,8,166)",
+)  # fmt: skip
+"""Worlds that no planner and no skill was trained in."""
 DEPARTURE_WORLDS = ("pillar(2,2,10)", "gremlin", "four-room")
 """In which fixed periods and departures of driving are looked at."""
 SEEDS = {"point": 5, "car": 5, "doggo": 3}
@@ -45,6 +52,7 @@ SKILL_SECONDS = {"point": 600.0, "car": 900.0, "doggo": 2400.0}
 PLANNER_SECONDS = {"point": 420.0, "car": 480.0, "doggo": 420.0}
 EVALUATION_SECONDS = {"point": 25.0, "car": 55.0, "doggo": 60.0}
 FINE_TUNING_SECONDS = 120.0
+WALK_SECONDS = 60.0
 
 DRIVING = {
     "no-repair": {"repair": False},
@@ -62,6 +70,7 @@ TRAINING = {
     "whole-episodes": ["skill.episode_steps=null"],
     "no-tilt-cost": ["reward.tilt=0"],
     "go-on-after-fall": ["skill.end_on_fall=false"],
+    "no-bold-rows": ["skill.bold_share=0"],
     "no-clock": ["skill.clock=false"],
     "layer-norm": ["skill.layer_norm=true"],
     "learned-plans": ["skill.planner=cnn"],
@@ -79,6 +88,8 @@ class Size:
     episodes: int = 1000
     paper_episodes: int = 200
     worlds: tuple[str, ...] = WORLDS
+    unseen: tuple[str, ...] = UNSEEN
+    unseen_episodes: int = 200
     training: tuple[str, ...] = ()
     """Settings of every training, laid over all others."""
     fine_tuning: tuple[str, ...] = ()
@@ -94,6 +105,8 @@ SMOKE = Size(
     episodes=4,
     paper_episodes=2,
     worlds=("pillar(1.2,1.2,2)", "two-room(1.2,1.2)"),
+    unseen=("pillar(1.5,1.5,3)",),
+    unseen_episodes=4,
     training=(
         *_SMALL, "planner.samples=24", "planner.worlds=['pillar(1.2,1.2,2)']", "threads=1",
         "skill.worlds=['pillar(1.2,1.2,2)']", "skill.num_envs=4", "skill.total_steps=128", "skill.learning_starts=64",
@@ -167,6 +180,24 @@ class _Maker:
             cells.append(
                 self._evaluate("astar", "astar", world, {"planner": "astar"}, bundle=bundle, needs=beside[world])
             )
+        for world in (*self.size.worlds, *self.size.unseen):
+            seen = world in self.size.worlds
+            cells.append(
+                Cell(
+                    experiment="walks",
+                    name=f"{self.robot}-{_slug(world)}",
+                    kind="walk",
+                    robot=self.robot,
+                    variant="shipped",
+                    world=world,
+                    bundle=bundle,
+                    settings={"episodes": self.size.episodes if seen else self.size.unseen_episodes},
+                    seconds=self.size.share * WALK_SECONDS,
+                )  # fmt: skip
+            )
+        for world in self.size.unseen:
+            fewer = {"episodes": self.size.unseen_episodes, "paper_episodes": 0}
+            cells.append(self._evaluate("unseen", "shipped", world, fewer, bundle=bundle))
         some = [world for world in self.size.worlds if world in (self.size.worlds[0], *DEPARTURE_WORLDS)]
         for world in some:
             for period in PERIODS:

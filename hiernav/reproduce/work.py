@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from hiernav.config import OptionConfig, RewardConfig, load_config
-from hiernav.evaluate import Policies, evaluate, open_policies, summarize, under_protocol
+from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
 from hiernav.reproduce.cells import Cell, Places, bundle_hashes
@@ -26,6 +26,9 @@ Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done."""
 
 EVALUATION_SEED = 0
+
+WALKERS = {"network": ("cnn", False), "verified": ("cnn", True), "astar": ("astar", False)}
+"""Whose plans are walked along: planner, and whether what collides is repaired."""
 
 
 @dataclass
@@ -45,6 +48,7 @@ def run_cell(cell: Cell, places: Places, report: Report) -> Outcome:
         "finetune": _fine_tune,
         "train": _train,
         "table2": _table2,
+        "walk": _walk,
         "film": _film,
     }[cell.kind](cell, places, report)
 
@@ -184,6 +188,21 @@ def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
     more = {"world": cell.world, "episodes": wanted["episodes"], "settings": wanted.get("settings", ())}
     found = measure(folder, wanted["samples"], wanted["preset"], cell.seed, **more, on_progress=show)
     return Outcome(found, {"run": "table2"}, wanted)
+
+
+def _walk(cell: Cell, places: Places, report: Report) -> Outcome:
+    assert cell.world is not None
+    folder, source = _policies(cell, places)
+    policies, world, count = open_policies(folder), parse_world(cell.world), cell.settings["episodes"]
+    metrics: dict[str, Any] = {}
+    for place, (name, (planner, repair)) in enumerate(WALKERS.items()):
+
+        def show(done: int, name: str = name, place: int = place) -> None:
+            report((place + done / count) / len(WALKERS), f"{name}: {done} of {count} walks")
+
+        metrics[name] = evaluate_plans(policies, world, planner, repair, count, EVALUATION_SEED, show)
+        metrics[name].pop("seconds")
+    return Outcome(metrics, source, cell.settings)
 
 
 def _film(cell: Cell, places: Places, report: Report) -> Outcome:
