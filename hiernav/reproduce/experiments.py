@@ -70,7 +70,6 @@ TRAINING = {
     "whole-episodes": ["skill.episode_steps=null"],
     "no-tilt-cost": ["reward.tilt=0"],
     "go-on-after-fall": ["skill.end_on_fall=false"],
-    "no-bold-rows": ["skill.bold_share=0"],
     "no-clock": ["skill.clock=false"],
     "layer-norm": ["skill.layer_norm=true"],
     "learned-plans": ["skill.planner=cnn"],

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModule, TensorDictModuleBase
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, TensorDictModule
 from torch.optim.adam import adam
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
@@ -49,33 +49,6 @@ warnings.filterwarnings("ignore", "No target network updater", UserWarning)
 
 
 _LEAST_ALPHA = 1e-8
-
-
-class PartlyBold(TensorDictModuleBase):
-    """A policy whose first rows take obstacles for farther away than they are.
-
-    A skill that has run into things learns to stand still where its lidar reads much, and what it no longer tries there
-    it cannot learn to be sound. The bold rows try: the first sees no obstacles at all, the others the more the later
-    they come. They are stored with what the lidar truly read.
-    """
-
-    in_keys, out_keys = ["observation"], ["action"]
-
-    def __init__(self, policy: ProbabilisticActor, share: float, lidar: slice) -> None:
-        super().__init__()
-        self.policy, self.share, self.lidar = policy, share, lidar
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation = tensordict["observation"].clone()
-        bold = round(self.share * len(observation))
-        observation[:bold, self.lidar] *= torch.arange(bold)[:, None] / max(bold, 1)
-        acted = self.policy(TensorDict({"observation": observation}, tensordict.batch_size))
-        return tensordict.set("action", acted["action"])
-
-
-def exploring(policy: ProbabilisticActor, skill: SkillConfig, layout: ObservationLayout) -> TensorDictModuleBase:
-    """What acts in training, with the weights of `policy`; a new one for every segment."""
-    return PartlyBold(policy, skill.bold_share, layout.slices["lidar"])
 
 
 class Learner:

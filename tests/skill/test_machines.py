@@ -52,7 +52,7 @@ def test_no_two_places_share_a_world_or_a_random_number(tmp_path: Path) -> None:
 
 def test_a_worker_acts_by_the_weights_it_is_given(tmp_path: Path) -> None:
     config = tiny_run.config(tmp_path, *workers.SETTINGS)
-    weights = make_acting_policy(config).policy.state_dict()
+    weights = make_acting_policy(config).state_dict()
     worker = workers.worker_here(config, random_frames=0)
     for wanted in (0.5, -0.25):
         for key, value in weights.items():

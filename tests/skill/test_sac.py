@@ -17,7 +17,7 @@ from hiernav.config import load_config  # noqa: E402
 from hiernav.nav.observation import observation_layout  # noqa: E402
 from hiernav.skill.networks import Actor, Critic  # noqa: E402
 from hiernav.skill.perceptrons import _rectify  # noqa: E402
-from hiernav.skill.sac import Learner, SacSettings, exploring  # noqa: E402
+from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 from hiernav.skill.train import alpha_floor, make_learner  # noqa: E402
 
 LAYOUT = observation_layout("point")
@@ -350,25 +350,3 @@ def test_the_exported_actor_is_the_mean_of_the_last_ones() -> None:
 def test_without_averaging_the_last_actor_is_exported() -> None:
     one = learner()
     assert one.average is one.actor
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_bold_rows_act_on_less_lidar_and_the_others_on_all_of_it(share: float) -> None:
-    seen: list[torch.Tensor] = []
-
-    def policy(tensordict: TensorDict) -> TensorDict:
-        seen.append(tensordict["observation"])
-        return tensordict.set("action", tensordict["observation"][:, :2])
-
-    observation = torch.rand(8, LAYOUT.size) + 0.1
-    step = TensorDict({"observation": observation.clone()}, (8,))
-    settings = load_config(None, [f"skill.bold_share={share}"]).skill
-    exploring(policy, settings, LAYOUT)(step)
-
-    bold, lidar = int(share * 8), LAYOUT.slices["lidar"]
-    gains = (seen[0][:, lidar] / observation[:, lidar]).mean(dim=1)
-    assert_close(gains, torch.tensor([k / bold for k in range(bold)] + [1.0] * (8 - bold)))
-    others = [k for k in range(LAYOUT.size) if not lidar.start <= k < lidar.stop]
-    assert_close(seen[0][:, others], observation[:, others])
-    assert_close(step["observation"], observation)  # what is stored
-    assert_close(step["action"], observation[:, :2])
