@@ -16,7 +16,6 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
 
-from hiernav.config import SkillConfig
 from hiernav.device import choose_precision
 from hiernav.nav.observation import ObservationLayout
 from hiernav.skill.loss import DirectSACLoss
