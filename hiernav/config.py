@@ -157,9 +157,6 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Annotated[int, Meta(ge=1)] | None,
         Meta(description="Cap on the steps of a training episode; null: that of its world."),
     ] = None
-    greedy_share: Annotated[
-        float, Meta(ge=0, le=1, description="Share of simulations that act without noise, as the exported skill does.")
-    ] = 0.0
     clock: Annotated[bool, Meta(description="Show the skill a gait clock of 3 Hz.")] = False
     precision: Annotated[
         Precision,

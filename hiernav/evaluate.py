@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -157,7 +157,7 @@ def evaluate_plans(
         parts.append(walk(plan, layouts, radius, max_plans=max(60, world.max_steps // 10)))
         if on_episodes is not None:
             on_episodes(min(first + _WALKERS, episodes))
-    collisions = np.concatenate([part.collisions for part in parts])
+    walks = WalkResult(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(WalkResult)))
     return {
         "world": str(world),
         "planner": planner,
@@ -165,11 +165,8 @@ def evaluate_plans(
         "episodes": episodes,
         "seed": seed,
         "radius_m": radius,
-        "collisions_mean": float(collisions.mean()),
-        "collisions_total": int(collisions.sum()),
-        "collision_free_rate": float((collisions == 0).mean()),
-        "reach_rate": float(np.concatenate([part.reached for part in parts]).mean()),
-        "plans_mean": float(np.concatenate([part.plans for part in parts]).mean()),
+        **walks.summary(),
+        "collisions_total": int(walks.collisions.sum()),
         **_plan_counts(plan),
         "seconds": round(time.perf_counter() - began, 2),
     }

@@ -17,11 +17,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hiernav.evaluate import evaluate_plans, open_policies
+from hiernav.reproduce.experiments import WORLDS
+from hiernav.reproduce.work import WALKERS
 from hiernav.sim.factory import expert_planner
 from hiernav.sim.layout import parse_world
-
-WORLDS = ("pillar(2,2,10)", "gremlin", "pillar(3,3,25)", "pillar(4,4,40)", "two-room", "four-room")
-PLANNERS = {"cnn": ("cnn", False), "cnn + repair": ("cnn", True), "astar": ("astar", False)}
 
 
 def main() -> int:
@@ -40,10 +39,10 @@ def main() -> int:
     print(f"disc of radius {radius} m, {arguments.episodes} episodes a world, seed {arguments.seed}")
     print(f"{'world':>16} {'planner':>13} {'collisions':>10} {'clean':>7} {'reach':>7} {'plans':>6} {'repaired':>9}")
     for world in arguments.world or WORLDS:
-        for name, (kind, repair) in PLANNERS.items():
+        for name, (kind, repair) in WALKERS.items():
             row = evaluate_plans(policies, parse_world(world), kind, repair, arguments.episodes, arguments.seed)
             rows.append(row)
-            verified = kind == "cnn" and repair
+            verified = name == "verified"
             touched += verified * row["collisions_total"]
             share = f"{row['repairs'] / row['proposals']:.4f}" if verified else "-"
             print(

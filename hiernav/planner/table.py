@@ -93,10 +93,7 @@ def measure(
         "robot": robot,
         "episodes": episodes,
         "epochs": config.planner.epochs,
-        "collisions_mean": float(result.collisions.mean()),
+        **result.summary(),
         "collisions_std": float(result.collisions.std(ddof=1)) if episodes > 1 else float("nan"),
-        "collision_free_rate": float((result.reached & (result.collisions == 0)).mean()),
-        "reach_rate": float(result.reached.mean()),
-        "plans_mean": float(result.plans.mean()),
         "error_m": trainer.validation["error"],
     }

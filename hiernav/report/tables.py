@@ -31,8 +31,8 @@ WHAT = {
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
     "no-alpha-floor": "no floor of the temperature", "whole-episodes": "training episodes run to the cap",
     "no-tilt-cost": "no cost of tilting", "go-on-after-fall": "training goes on after a fall",
-    "no-clock": "no gait clock",
-    "layer-norm": "with layer normalisation in the critics", "learned-plans": "trained with the network's plans",
+    "no-clock": "no gait clock", "layer-norm": "with layer normalisation in the critics",
+    "learned-plans": "trained with the network's plans",
 }  # fmt: skip
 """Ablation -> what differs."""
 

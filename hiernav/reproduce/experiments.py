@@ -16,7 +16,7 @@ import msgspec
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.film.film import film_name
-from hiernav.reproduce.cells import Cell
+from hiernav.reproduce.cells import Cell, Kind
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 
@@ -53,6 +53,7 @@ PLANNER_SECONDS = {"point": 420.0, "car": 480.0, "doggo": 420.0}
 EVALUATION_SECONDS = {"point": 25.0, "car": 55.0, "doggo": 60.0}
 FINE_TUNING_SECONDS = 120.0
 WALK_SECONDS = 60.0
+FILM_SECONDS = 15.0
 
 DRIVING = {
     "no-repair": {"repair": False},
@@ -180,20 +181,8 @@ class _Maker:
                 self._evaluate("astar", "astar", world, {"planner": "astar"}, bundle=bundle, needs=beside[world])
             )
         for world in (*self.size.worlds, *self.size.unseen):
-            seen = world in self.size.worlds
-            cells.append(
-                Cell(
-                    experiment="walks",
-                    name=f"{self.robot}-{_slug(world)}",
-                    kind="walk",
-                    robot=self.robot,
-                    variant="shipped",
-                    world=world,
-                    bundle=bundle,
-                    settings={"episodes": self.size.episodes if seen else self.size.unseen_episodes},
-                    seconds=self.size.share * WALK_SECONDS,
-                )  # fmt: skip
-            )
+            count = self.size.episodes if world in self.size.worlds else self.size.unseen_episodes
+            cells.append(self._show("walks", "walk", world, bundle, {"episodes": count}, WALK_SECONDS))
         for world in self.size.unseen:
             fewer = {"episodes": self.size.unseen_episodes, "paper_episodes": 0}
             cells.append(self._evaluate("unseen", "shipped", world, fewer, bundle=bundle))
@@ -209,19 +198,7 @@ class _Maker:
             for world in some:
                 cells.append(self._evaluate("ablations", variant, world, settings, bundle=bundle, needs=beside[world]))
         for world in self.size.worlds:
-            cells.append(
-                Cell(
-                    experiment="films",
-                    name=f"{self.robot}-{_slug(world)}",
-                    kind="film",
-                    robot=self.robot,
-                    variant="shipped",
-                    world=world,
-                    bundle=bundle,
-                    settings=FILM,
-                    seconds=self.size.share * 15.0,
-                )  # fmt: skip
-            )
+            cells.append(self._show("films", "film", world, bundle, FILM, FILM_SECONDS))
         for world in self.size.worlds:
             cells.append(
                 self._evaluate(
@@ -293,6 +270,14 @@ class _Maker:
             # another configuration is another folder: no training goes on in one of other settings
             run=f"{name}-{hashlib.sha256(config.encode()).hexdigest()[:8]}", needs=needs,
             seconds=self.size.share * (seconds + both * PLANNER_SECONDS[self.robot]),
+        )  # fmt: skip
+
+    def _show(
+        self, experiment: str, kind: Kind, world: str, bundle: str, settings: dict[str, Any], seconds: float
+    ) -> Cell:
+        return Cell(
+            experiment=experiment, name=f"{self.robot}-{_slug(world)}", kind=kind, robot=self.robot, variant="shipped",
+            world=world, bundle=bundle, settings=settings, seconds=self.size.share * seconds,
         )  # fmt: skip
 
     def _evaluate(

@@ -108,6 +108,23 @@ class Walks(msgspec.Struct, frozen=True):
     collisions_mean: float
 
 
+class PlanWalk(msgspec.Struct, frozen=True):
+    """What is shown of walks along the plans of one planner; proposals and repairs where they are verified."""
+
+    collisions_mean: float
+    reach_rate: float
+    proposals: int = 0
+    repairs: int = 0
+
+
+class PlanWalks(msgspec.Struct, frozen=True):
+    """The same walks along the plans of three."""
+
+    network: PlanWalk
+    verified: PlanWalk
+    astar: PlanWalk
+
+
 class Film(msgspec.Struct, frozen=True):
     """What a film's result holds."""
 
@@ -179,6 +196,8 @@ def _check_contents(result: Result) -> None:
     """Raise if what the experiment is about is missing."""
     if result.experiment == "table2":
         msgspec.convert(result.metrics, Walks)
+    elif result.experiment == "walks":
+        msgspec.convert(result.metrics, PlanWalks)
     elif result.experiment == "films":
         msgspec.convert(result.metrics, Film)
     elif result.experiment != "planners" and drive_of(result) is None:

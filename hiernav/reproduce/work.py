@@ -195,11 +195,11 @@ def _walk(cell: Cell, places: Places, report: Report) -> Outcome:
     folder, source = _policies(cell, places)
     policies, world, count = open_policies(folder), parse_world(cell.world), cell.settings["episodes"]
     metrics: dict[str, Any] = {}
-    for place, (name, (planner, repair)) in enumerate(WALKERS.items()):
 
-        def show(done: int, name: str = name, place: int = place) -> None:
-            report((place + done / count) / len(WALKERS), f"{name}: {done} of {count} walks")
+    def show(done: int) -> None:
+        report((len(metrics) + done / count) / len(WALKERS), f"{done} of {count} walks, {len(metrics)} planners done")
 
+    for name, (planner, repair) in WALKERS.items():
         metrics[name] = evaluate_plans(policies, world, planner, repair, count, EVALUATION_SEED, show)
         metrics[name].pop("seconds")
     return Outcome(metrics, source, cell.settings)

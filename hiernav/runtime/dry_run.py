@@ -19,13 +19,12 @@ from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.policy import check_golden, load_policies
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.robot import VECTOR_SENSORS
+from hiernav.runtime.robot import READINGS
 from hiernav.runtime.settings import Settings
 from hiernav.runtime.timing import Histogram
 
 WAKES = 200
 PERIOD = 0.005
-SENSORS = (*VECTOR_SENSORS, "lidar", "position_fix", "rotation")
 
 
 def report(
@@ -71,8 +70,8 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
 
 def _check_robot(robot: ProcessRobot) -> dict[str, Any]:
     frame = robot.read()
-    present = [name for name in SENSORS if getattr(frame, name) is not None]
-    absent = [name for name in SENSORS if name not in present]
+    present = [name for name in READINGS if getattr(frame, name) is not None]
+    absent = [name for name in READINGS if name not in present]
     broken = [name for name in present if not np.isfinite(getattr(frame, name)).all()]
     return {
         "control period": f"{1e3 * robot.control_period:g} ms",

@@ -17,7 +17,7 @@ from hiernav.nav.occupancy import OccupancyMap, check_geometry
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.estimate import Estimate, Trust
 from hiernav.runtime.observe import Event, TickRecord
-from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame, Truth
+from hiernav.runtime.robot import READINGS, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode
 
 Number = float | Literal["nan", "inf", "-inf"]
@@ -325,17 +325,14 @@ def schema(kind: type[Message]) -> bytes:
     return msgspec.json.encode({"title": kind.__name__, **components[kind.__name__]})
 
 
-_READINGS = (*VECTOR_SENSORS, "lidar", "position_fix", "rotation")
-
-
 def _sensors(frame: SensorFrame) -> Sensors:
-    readings = {name: _numbers(getattr(frame, name)) for name in _READINGS}
+    readings = {name: _numbers(getattr(frame, name)) for name in READINGS}
     extra: Mapping[str, Any] = {name: _numbers(value) for name, value in frame.extra.items()}
     return Sensors(stamp=_number(frame.stamp), extra=dict(extra), fix_stamp=_number(frame.fix_stamp), **readings)
 
 
 def _frame(message: Sensors) -> SensorFrame:
-    readings = {name: _array(getattr(message, name)) for name in _READINGS}
+    readings = {name: _array(getattr(message, name)) for name in READINGS}
     extra = {name: _array(value) for name, value in message.extra.items()}
     return SensorFrame(_float(message.stamp), extra=extra, fix_stamp=_float(message.fix_stamp), **readings)
 

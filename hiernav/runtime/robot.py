@@ -10,6 +10,8 @@ import numpy as np
 
 VECTOR_SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
 _TERMS = (*VECTOR_SENSORS, "lidar")
+READINGS = (*_TERMS, "position_fix", "rotation")
+"""Fields of a frame that are an array, or None where nothing was read."""
 
 
 @dataclass(frozen=True)

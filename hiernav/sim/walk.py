@@ -22,6 +22,15 @@ class WalkResult:
     plans: np.ndarray
     """Plans that were asked for."""
 
+    def summary(self) -> dict[str, float]:
+        """Means over the episodes; `collision_free_rate` is that of reaching the goal without a collision."""
+        return {
+            "collisions_mean": float(self.collisions.mean()),
+            "collision_free_rate": float((self.reached & (self.collisions == 0)).mean()),
+            "reach_rate": float(self.reached.mean()),
+            "plans_mean": float(self.plans.mean()),
+        }
+
 
 def walk(
     planner: Planner, layouts: Sequence[Layout], radius: float = 0.1, stride: int = 5, max_plans: int = 60

@@ -19,7 +19,6 @@ from hiernav.sim.factory import RandomLayouts, make_task
 from hiernav.sim.layout import WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.skill.env import NavigationEnv
-from hiernav.skill.sac import exploring
 
 _BATCH_FRAMES = 128
 """Steps collected by one process between two bursts of updates, at least one per simulation."""
@@ -62,7 +61,7 @@ class LocalBatches:
         per_batch = frames_of_batch(skill.num_envs, frames)
         collector = Collector(
             self._env,
-            exploring(self.policy, skill),
+            self.policy,
             frames_per_batch=per_batch,
             total_frames=max(1, frames // per_batch) * per_batch,
             init_random_frames=random_batches(self.config, steps, per_batch) * per_batch,

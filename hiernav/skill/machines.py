@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.modules import ProbabilisticActor
 
 from hiernav.config import ConfigError, TrainConfig
 from hiernav.nav.option import Planner
@@ -22,7 +22,7 @@ from hiernav.sim.robots import get_robot
 from hiernav.skill.collect import training_layouts
 from hiernav.skill.env import NavigationEnv
 from hiernav.skill.networks import Actor
-from hiernav.skill.sac import exploring, make_policy
+from hiernav.skill.sac import make_policy
 
 Weights = dict[str, np.ndarray]
 
@@ -44,7 +44,7 @@ class WorkerCollector(Collector):
 
     def load(self, weights: Weights) -> None:
         """Act with these weights from now on."""
-        self.policy.policy.load_state_dict({key: torch.tensor(value) for key, value in weights.items()})
+        self.policy.load_state_dict({key: torch.tensor(value) for key, value in weights.items()})
 
     def rollout(self) -> TensorDict:
         """Steps of all simulations. An error waits for `check`: torchrl would let the process die of it, untold."""
@@ -176,11 +176,11 @@ def make_env(config: TrainConfig, planner: Planner | None = None) -> NavigationE
     return NavigationEnv(make_task(config, config.skill.num_envs, planner, training=True))
 
 
-def make_acting_policy(config: TrainConfig) -> TensorDictModuleBase:
+def make_acting_policy(config: TrainConfig) -> ProbabilisticActor:
     """The policy of one worker, which waits for its weights."""
     action_dim = get_robot(config.robot).action_dim
     actor = Actor(skill_layout(config), action_dim, config.skill.hidden, layer_norm=False)
-    return exploring(make_policy(actor, action_dim), config.skill)
+    return make_policy(actor, action_dim)
 
 
 def _leave_interrupts_to_the_trainer() -> None:

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModule, TensorDictModuleBase
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, TensorDictModule
 from torch.optim.adam import adam
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ValueEstimators
 
-from hiernav.config import SkillConfig
 from hiernav.device import choose_precision
 from hiernav.nav.observation import ObservationLayout
 from hiernav.skill.loss import DirectSACLoss
@@ -49,31 +48,6 @@ warnings.filterwarnings("ignore", "No target network updater", UserWarning)
 
 
 _LEAST_ALPHA = 1e-8
-
-
-class PartlyGreedy(TensorDictModuleBase):
-    """A policy whose first rows act without noise.
-
-    They fill the replay buffer with the states that the exported, noiseless skill gets into and stays in, which the
-    noise of the others leads out of before anything can be learned there.
-    """
-
-    in_keys, out_keys = ["observation"], ["action"]
-
-    def __init__(self, policy: ProbabilisticActor, share: float) -> None:
-        super().__init__()
-        self.policy, self.share = policy, share
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self.policy(tensordict)
-        greedy = round(self.share * len(tensordict))
-        action = torch.cat([torch.tanh(tensordict["loc"][:greedy]), tensordict["action"][greedy:]])
-        return tensordict.set("action", action)
-
-
-def exploring(policy: ProbabilisticActor, skill: SkillConfig) -> TensorDictModuleBase:
-    """What acts in training, with the weights of `policy`; a new one for every segment."""
-    return PartlyGreedy(policy, skill.greedy_share)
 
 
 class Learner:

@@ -84,6 +84,14 @@ def test_numbers_of_the_page_are_those_of_the_results(results, book, robot):
         assert trained.startswith(f"{sum(values) / len(values):.3f} ") and trained.endswith(f"{len(values)} seeds")
 
 
+def test_walks_are_read_and_shown_for_every_world(results, book, page):
+    assert book.damaged == []
+    for cell in (cell for cell in made_up.CELLS.values() if cell.kind == "walk"):
+        found = read_result(results, cell.id).metrics
+        assert f"{100.0 * found['verified']['repairs'] / found['verified']['proposals']:.1f} %" in page
+        assert f"<td>{found['network']['collisions_mean']:.3f}</td>" in page
+
+
 def test_the_papers_numbers_are_there_and_belong_where_they_stand(book, page):
     reach, steps = (rows(tables.table3(book, "doggo", name)) for name in ("reach_rate", "steps_mean"))
     assert [reach["gremlin"][k] for k in (6, 0, 3)] == ["0.67", "0.99", "1.00"]
