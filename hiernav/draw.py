@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.sim.layout import (
     GOAL_RADIUS,
     GREMLIN_HALF_SIZE,
     GREMLIN_ORBIT,
-    PILLAR_RADIUS,
     Layout,
     wall_boxes,
 )

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hiernav.draw import COLLISION, EDGE, GOAL, GREMLIN, OBSTACLE, PATH, PLAN, field_picture
-from hiernav.nav.lidar import LIDAR_BINS, lidar_closeness
+from hiernav.nav.lidar import LIDAR_BINS, lidar_closeness, surface_distance
 from hiernav.nav.option import TerminationReason
 from hiernav.sim.layout import GREMLIN_HALF_SIZE
 from hiernav.sim.outline import Outlines
@@ -93,8 +93,8 @@ class TopView:
     def _draw_lidar(self, picture: Frame, time: float) -> None:
         """One fan a sector, out to the distance of what the sector sees."""
         pose = self._task.pose[:1]
-        closeness = lidar_closeness(pose, self._task.layouts[0].obstacle_points(time)[None])[0]
-        distance = np.minimum(-np.log(np.maximum(closeness, 1e-9)), _LIDAR_RANGE)
+        closeness = lidar_closeness(pose, self._task.layouts[0].obstacle_discs(time)[None])[0]
+        distance = np.minimum(surface_distance(closeness), _LIDAR_RANGE)
         fans = picture.copy()
         for sector in range(LIDAR_BINS):
             bearings = pose[0, 2] + 2.0 * np.pi / LIDAR_BINS * (sector + np.linspace(0.05, 0.95, 8))

@@ -181,7 +181,7 @@ class SimRobot:
         return SensorFrame(
             stamp=now,
             **readings,
-            lidar=lidar_closeness(sim.pose, self.layout.obstacle_points(now)[None])[0],
+            lidar=lidar_closeness(sim.pose, self.layout.obstacle_discs(now)[None])[0],
             extra=extra,
             position_fix=fix,
             fix_stamp=fix_stamp,

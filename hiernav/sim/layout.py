@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.mapfile import load_map
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, draw_discs, empty_map
 
-PILLAR_RADIUS = 0.2
 PILLAR_HALF_HEIGHT = 0.5
 GREMLIN_HALF_SIZE = 0.1
 GREMLIN_ORBIT = 0.3
@@ -110,15 +110,15 @@ class Layout:
         """(G, 2) [m] at `time` [s]: all gremlins run on their circles at 1 rad/s and in phase."""
         return self.gremlins + GREMLIN_ORBIT * np.array([math.cos(time), math.sin(time)])
 
-    def obstacle_points(self, time: float) -> NDArray[np.float64]:
-        """(K, 2) [m], what the lidar sees at `time` [s]; K does not change with time.
+    def obstacle_discs(self, time: float) -> NDArray[np.float64]:
+        """(K, 3) centre and radius [m], what the lidar sees at `time` [s]; K does not change with time.
 
-        Pillars and gremlins: their centres. Walls: points at most 0.1 m apart along the centre line, both ends
-        included. Map files: centres of occupied pixels with a free neighbour, one in each 0.1 m square.
+        Pillars and gremlins: one each. Walls: points at most 0.1 m apart along the centre line, both ends included, as
+        thick as the wall. Map files: occupied pixels with a free neighbour, one in each 0.1 m square.
         """
         if len(self.gremlins) == 0:
-            return self._static_points
-        return np.concatenate((self._static_points, self.gremlin_positions(time)))
+            return self._static_discs
+        return np.concatenate((self._static_discs, _discs(self.gremlin_positions(time), GREMLIN_HALF_SIZE)))
 
     def occupancy(self, time: float) -> OccupancyMap:
         """The map at `time` [s]: pillars as discs, gremlins as discs around their boxes, walls as boxes.
@@ -134,11 +134,11 @@ class Layout:
         return OccupancyMap(occupied, static.resolution, static.origin)
 
     @cached_property
-    def _static_points(self) -> NDArray[np.float64]:
-        parts = [self.pillars]
-        parts += [_points_along(wall) for wall in self.walls]
+    def _static_discs(self) -> NDArray[np.float64]:
+        parts = [_discs(self.pillars, PILLAR_RADIUS)]
+        parts += [_discs(_points_along(wall), 0.5 * WALL_THICKNESS) for wall in self.walls]
         if self.base_map is not None:
-            parts.append(_surface_points(self.base_map))
+            parts.append(_discs(_surface_points(self.base_map), 0.5 * self.base_map.resolution))
         return np.concatenate(parts)
 
     @cached_property
@@ -231,6 +231,10 @@ def cached_map(path: str) -> OccupancyMap:
 @lru_cache(maxsize=8)
 def _load_version(path: str, mtime_ns: int, size: int) -> OccupancyMap:
     return load_map(path)
+
+
+def _discs(centers: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    return np.column_stack((centers, np.full(len(centers), radius)))
 
 
 def _points_along(wall: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -99,7 +99,7 @@ class NavigationTask:
         self._extent = np.zeros((self.num_rows, 4))
         self.steps = np.zeros(self.num_rows, dtype=np.int64)
         self._max_steps = np.zeros(self.num_rows, dtype=np.int64)
-        self._points = np.full((self.num_rows, 1, 2), np.nan)
+        self._discs = np.full((self.num_rows, 1, 3), np.nan)
         self._moving = np.zeros(self.num_rows, dtype=bool)
         self.observation = np.zeros((self.num_rows, layout.size), dtype=np.float32)
 
@@ -129,7 +129,7 @@ class NavigationTask:
             self.goal[row], self._extent[row] = layout.goal, layout.extent
             self._max_steps[row] = min(layout.spec.max_steps, self._cap)
             self._moving[row] = len(layout.gremlins) > 0
-            self._set_points(row, layout.obstacle_points(0.0))
+            self._set_discs(row, layout.obstacle_discs(0.0))
         self.steps[rows] = 0
         self.option.reset(rows)
         if self.recovery is not None:
@@ -147,7 +147,7 @@ class NavigationTask:
         for row in np.flatnonzero(self._moving).tolist():
             now = float(self.sim.time[row])
             self._maps[row] = self.layouts[row].occupancy(now)
-            self._set_points(row, self.layouts[row].obstacle_points(now))
+            self._set_discs(row, self.layouts[row].obstacle_discs(now))
         after = self.sim.pose[:, :2]
         broken = ~self.sim.finite
         reached = np.linalg.norm(after - self.goal, axis=-1) <= GOAL_RADIUS
@@ -185,7 +185,7 @@ class NavigationTask:
             self.option.waiting |= self.recovery.ended
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
         values = guided(sensors, pose, plan, goal, self.steps[pick] * self.robot.control_period)
-        values["lidar"] = lidar_closeness(pose, self._points[pick])
+        values["lidar"] = lidar_closeness(pose, self._discs[pick])
         built = self.layout.build(values)
         if not np.isfinite(built).all():
             built = np.nan_to_num(built)  # a broken row is reported, not passed on
@@ -196,10 +196,10 @@ class NavigationTask:
             self.observation[rows] = built
         return option
 
-    def _set_points(self, row: int, points: np.ndarray) -> None:
-        if len(points) > self._points.shape[1]:
-            wider = np.full((self.num_rows, len(points), 2), np.nan)
-            wider[:, : self._points.shape[1]] = self._points
-            self._points = wider
-        self._points[row] = np.nan
-        self._points[row, : len(points)] = points
+    def _set_discs(self, row: int, discs: np.ndarray) -> None:
+        if len(discs) > self._discs.shape[1]:
+            wider = np.full((self.num_rows, len(discs), 3), np.nan)
+            wider[:, : self._discs.shape[1]] = self._discs
+            self._discs = wider
+        self._discs[row] = np.nan
+        self._discs[row, : len(discs)] = discs

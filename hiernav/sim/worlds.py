@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.search import is_solvable
 from hiernav.sim.layout import (
@@ -17,7 +18,6 @@ from hiernav.sim.layout import (
     GREMLIN_HALF_SIZE,
     GREMLIN_ORBIT,
     PILLAR_HALF_HEIGHT,
-    PILLAR_RADIUS,
     WALL_THICKNESS,
     Layout,
     WorldSpec,

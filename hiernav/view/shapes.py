@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hiernav.nav.lidar import LIDAR_BINS
+from hiernav.nav.lidar import LIDAR_BINS, surface_distance
 from hiernav.nav.occupancy import OccupancyMap
 
 Array = NDArray[np.floating]
@@ -89,10 +89,9 @@ def lidar_arcs(pose: Array, closeness: Array, z: float) -> Array:
     """An arc in each sector at the distance that its closeness stands for: (S, 2, 3) segments; none beyond reach."""
     sector = 2.0 * math.pi / LIDAR_BINS
     arcs = []
-    for k, value in enumerate(np.asarray(closeness, dtype=np.float64)):
-        if not value > math.exp(-LIDAR_REACH):
+    for k, distance in enumerate(surface_distance(closeness).tolist()):
+        if not distance < LIDAR_REACH:
             continue
-        distance = -math.log(min(float(value), 1.0))
         angles = pose[2] + sector * (k + np.linspace(0.0, 1.0, 7))
         arc = pose[:2] + distance * np.column_stack([np.cos(angles), np.sin(angles)])
         arcs.append(segments(arc, z))

@@ -43,10 +43,10 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
     def observe() -> np.ndarray:
         plans = np.stack([plan, plan * flip])
         goals = np.stack([w.goal for w in worlds])
-        points = np.stack([w.obstacle_points(0.0) for w in worlds])
+        discs = np.stack([w.obstacle_discs(0.0) for w in worlds])
         values = {
             **sim.sensors,
-            "lidar": lidar_closeness(sim.pose, points),
+            "lidar": lidar_closeness(sim.pose, discs),
             "waypoints": world_to_body(plans, sim.pose).reshape(2, -1),
             "goal": world_to_body(goals[:, None], sim.pose)[:, 0],
             "clock": clock_phase(sim.time),

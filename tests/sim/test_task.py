@@ -9,7 +9,7 @@ from small_tasks import WORLD, Silent, Straight, facing_goal, still, task_of, te
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.nav.frames import body_to_world
-from hiernav.nav.lidar import lidar_closeness
+from hiernav.nav.lidar import PILLAR_RADIUS, lidar_closeness
 from hiernav.nav.option import TerminationReason
 from hiernav.sim.factory import make_task
 from hiernav.sim.worlds import sample_layout
@@ -172,7 +172,8 @@ def test_the_observation_holds_what_the_robot_senses_and_its_plan_in_its_own_fra
         plan = body_to_world(parts["waypoints"].astype(float).reshape(2, 10, 2), task.pose)
         assert_allclose(plan, step.option.plan, atol=1e-5)
         for row, layout in enumerate(layouts):
-            seen = lidar_closeness(task.pose[row : row + 1], layout.pillars[None])
+            pillars = np.column_stack((layout.pillars, np.full(len(layout.pillars), PILLAR_RADIUS)))
+            seen = lidar_closeness(task.pose[row : row + 1], pillars[None])
             assert_allclose(parts["lidar"][row], seen[0], atol=1e-6)
         for name in task.sim.sensors:
             assert_allclose(parts[name], task.sim.sensors[name], rtol=1e-5, atol=1e-5)

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.search import is_solvable
 from hiernav.sim.worlds import (
     GOAL_RADIUS,
     GREMLIN_HALF_SIZE,
     GREMLIN_ORBIT,
-    PILLAR_RADIUS,
     WALL_THICKNESS,
     Layout,
     WorldError,
@@ -296,21 +296,24 @@ def test_the_map_and_the_lidar_follow_the_gremlins() -> None:
     for time in (0.0, 1.0, 4.0):
         positions = layout.gremlin_positions(time)
         assert layout.occupancy(time).occupied_at(positions).all()
-        assert layout.obstacle_points(time) == pytest.approx(positions)
+        assert layout.obstacle_discs(time)[:, :2] == pytest.approx(positions)
+        assert (layout.obstacle_discs(time)[:, 2] == 0.1).all()
     assert (layout.occupancy(0.0).occupied != layout.occupancy(np.pi).occupied).any()
 
 
 def test_worlds_that_stand_still_keep_one_map() -> None:
     layout = sample_layout(parse_world("pillar(2,2,10)"), 5)
     assert layout.occupancy(0.0) is layout.occupancy(9.0)
-    assert (layout.obstacle_points(3.0) == layout.pillars).all()
+    assert (layout.obstacle_discs(3.0)[:, :2] == layout.pillars).all()
+    assert (layout.obstacle_discs(3.0)[:, 2] == 0.2).all()
 
 
 @pytest.mark.parametrize("name", ["two-room", "four-room"])
 def test_walls_are_seen_every_0_1_m_along_their_centre_line(name: str) -> None:
     layout = sample_layout(parse_world(name), 5)
-    points = layout.obstacle_points(0.0)
-    first = 0
+    discs = layout.obstacle_discs(0.0)
+    points, first = discs[:, :2], 0
+    assert (discs[:, 2] == 0.05).all(), "half as thick as the wall"
     for wall in layout.walls:
         length = np.abs(wall[2:] - wall[:2]).max()
         count = math.ceil(length / 0.1 - 1e-9) + 1
@@ -355,7 +358,8 @@ def test_map_starts_and_goals_have_room_and_a_path(map_path: str, seed: int) -> 
 
 def test_a_map_file_is_seen_by_its_surfaces(map_path: str) -> None:
     layout = sample_layout(parse_world(map_path), 0)
-    points = layout.obstacle_points(0.0)
+    points = layout.obstacle_discs(0.0)[:, :2]
+    assert (layout.obstacle_discs(0.0)[:, 2] == 0.025).all(), "half a pixel"
     field = layout.occupancy(0.0)
     assert field.occupied_at(points).all()
     squares = np.floor((points - np.array(field.origin)) / 0.1 + 1e-9)

@@ -50,7 +50,8 @@ def test_lidar_arcs_lie_where_the_obstacles_are():
     pose = np.array([1.0, -1.0, 0.7])
     bearing = pose[2] + math.radians(36.0 * 2.5)
     obstacle = pose[:2] + 1.2 * np.array([math.cos(bearing), math.sin(bearing)])
-    closeness = lidar_closeness(pose[None], obstacle[None, None])[0]
+    closeness = lidar_closeness(pose[None], np.array([[[*obstacle, 0.3]]]))[0]
     arcs = shapes.lidar_arcs(pose, closeness, 0.0).reshape(-1, 3)[:, :2]
-    assert np.linalg.norm(arcs - obstacle, axis=1).min() < 0.15
+    nearest = pose[:2] + 0.9 * (obstacle - pose[:2]) / 1.2
+    assert np.linalg.norm(arcs - nearest, axis=1).min() < 0.15
     assert shapes.lidar_arcs(pose, np.zeros(10), 0.0).shape == (0, 2, 3)
