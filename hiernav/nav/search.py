@@ -7,6 +7,7 @@ pass where there is not. With `soft_margin = 0` the cost is the length.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import cv2
@@ -55,6 +56,8 @@ class PathField:
         self.occupancy, self.radius = occupancy, radius
         self.soft_margin, self.soft_weight = soft_margin, soft_weight
         self.goal = np.array(goal, dtype=np.float64)
+        # by how much more must fit where a line is looked at, so that the disc fits in between
+        self._slack = math.hypot(radius, 0.5 * _SAMPLE) - radius
         self._centers, self._shape = _cell_centers(occupancy)
         clearance = occupancy.clearance_at(self._centers)
         self._free = clearance >= radius
@@ -92,11 +95,11 @@ class PathField:
         while cell != self.goal_cell and len(cells) < limit:
             cell = self._next[cell]
             cells.append(cell)
-        if len(cells) > 1 and cells[0] == own:
-            del cells[0]  # its centre may lie behind the start
         vertices = self._centers[cells]
         if cell == self.goal_cell:
             vertices = np.concatenate([vertices[:-1], self._end[None]])
+        if len(cells) > 1 and cells[0] == own and not self._led_astray(start, vertices[1]):
+            vertices = vertices[1:]  # the centre of the start's own cell may lie behind it
         return np.concatenate([start[None], vertices])
 
     def refusal(self, start: np.ndarray) -> str | None:
@@ -119,14 +122,17 @@ class PathField:
         t = (np.arange(len(line)) - firsts[line]) / (counts - 1)[line]
         clearance = self.occupancy.clearance_at(begin[line] + t[:, None] * delta[line])
         mean = np.add.reduceat(self._factor(clearance), firsts) / counts
-        return np.where(np.minimum.reduceat(clearance, firsts) >= self.radius, length * mean, np.inf)
+        return np.where(np.minimum.reduceat(clearance, firsts) >= self.radius + self._slack, length * mean, np.inf)
 
     def waypoints(self, start: np.ndarray, count: int = 10, spacing: float = 0.1) -> np.ndarray | None:
-        """The first `count` waypoints (count, 2) of the smoothed path, padded with the goal; None without a path."""
+        """The first `count` waypoints (count, 2) of the smoothed path, padded with the goal; None without a path.
+
+        From a start where the disc fits it fits at every waypoint.
+        """
         path = self.path_from(start, max_vertices=int(3 * count * spacing / CELL) + 4)
         if path is None:
             return None
-        return resample(self.smooth(path, count * spacing), count, spacing)
+        return self._given_room(resample(self.smooth(path, count * spacing), count, spacing))
 
     def smooth(self, path: np.ndarray, length: float = np.inf) -> np.ndarray:
         """Replace stretches of a path by the longest straight lines that cost no more, until `length` is covered."""
@@ -142,6 +148,25 @@ class PathField:
             here = following
             kept.append(path[here])
         return np.array(kept)
+
+    def _given_room(self, points: np.ndarray) -> np.ndarray:
+        """Points (K, 2), moved where they lack a hair of room: only the centres of cells are known to be free."""
+        lack = self.radius - self.occupancy.clearance_at(points)
+        for row in np.flatnonzero((lack > 0.0) & (lack < 0.25 * CELL)).tolist():
+            around = points[row] + 0.1 * CELL * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+            room = self.occupancy.clearance_at(around)
+            uphill = np.array([room[0] - room[1], room[2] - room[3]])
+            moved = points[row] + np.arange(1, 6)[:, None] * 0.05 * CELL * uphill / max(float(np.hypot(*uphill)), 1e-9)
+            fits = np.flatnonzero(self.occupancy.is_free(moved, self.radius))
+            if len(fits):
+                points[row] = moved[fits[0]]
+        return points
+
+    def _led_astray(self, start: np.ndarray, vertex: np.ndarray) -> bool:
+        """Whether a straight line to a vertex takes room from a disc that has it at the start."""
+        return bool(
+            self.occupancy.clearance_at(start) >= self.radius and not self._visible(start[None], vertex[None])[0]
+        )
 
     def _visible(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         return np.isfinite(self.line_cost(begin, end))
