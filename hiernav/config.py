@@ -197,6 +197,7 @@ class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         float, Meta(description="Per unit that the vertical part of the body's axis falls short of 0.8.")
     ] = -3.0
     fall: Annotated[float, Meta(description="Per control step on its back; see skill.end_on_fall.")] = -3.0
+    time: Annotated[float, Meta(description="Per control step: below 0, standing still is no way out.")] = 0.0
     goal_distance: Annotated[float, Meta(description="Per metre of distance to the goal, every step.")] = 0.0
     lookahead_m: Annotated[
         float,

@@ -10,7 +10,7 @@ import numpy as np
 from hiernav.config import RewardConfig
 from hiernav.nav import path
 
-TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "tilt", "fall", "goal_distance")
+TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "tilt", "fall", "time", "goal_distance")
 
 _LEVEL = 0.8
 """Uprightness below which a body counts as tilted: 37 degrees, more than a sound gait sways."""
@@ -52,6 +52,7 @@ def reward_terms(
         "leave_field": left.astype(np.float64),
         "tilt": np.maximum(_LEVEL - upright, 0.0),
         "fall": (upright < 0.0).astype(np.float64),
+        "time": np.ones(len(before)),
         "goal_distance": np.linalg.norm(after - goal, axis=-1),
     }
 

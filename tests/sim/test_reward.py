@@ -70,8 +70,9 @@ def earned_on_a_tour(config: RewardConfig, corners: object, occupancy: Occupancy
 # the terms
 
 
-def test_standing_still_on_a_waypoint_is_worth_nothing() -> None:
+def test_standing_still_on_a_waypoint_is_worth_nothing_but_its_time() -> None:
     terms = terms_of((0.3, 0.0), (0.3, 0.0))
+    assert terms.pop("time") == 1.0
     assert terms.pop("goal_distance") == pytest.approx(1.7)
     assert terms == pytest.approx(dict.fromkeys(terms, 0.0), abs=1e-12)
 
