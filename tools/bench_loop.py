@@ -112,7 +112,7 @@ def measure(
         def tick(self, record: TickRecord) -> None:
             if self.end is None:
                 self.end = record.time + seconds
-            if self.settled is None and record.time > self.end - seconds + min(5.0, 0.2 * seconds):
+            if self.settled is None and record.time > self.end - seconds + min(60.0, 0.2 * seconds):
                 self.settled = record.time
                 facts["resident"] = resident()
             if self.stop_asked is not None:
