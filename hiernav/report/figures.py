@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from hiernav.report import paper
 from hiernav.report.book import Book, curve, of_seeds
-from hiernav.reproduce.experiments import PERIODS, ROBOTS, WORLDS
+from hiernav.reproduce.experiments import PERIODS, ROBOTS, TABLE3_ROBOT, WORLDS
 
 OURS, BASELINE, PAPER, FINE_TUNED, ASTAR = "#3b82c4", "#d97a1f", "#8b8f98", "#3f9b6c", "#9b6bc0"
 _INK = "#010203"  # becomes the page's own colour
@@ -121,7 +121,7 @@ def reach(book: Book, robot: str) -> str | None:
                     )  # fmt: skip
                     first = False
         for place, world in enumerate(WORLDS):
-            if robot == paper.TABLE3_ROBOT and world in paper.TABLE3:
+            if robot == TABLE3_ROBOT and world in paper.TABLE3:
                 best, _ = paper.best_of_table3(world)
                 known = "the paper's best" if place == 1 else None
                 axes.plot(best, place, "|", color=PAPER, markersize=20, markeredgewidth=2, label=known)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hiernav.report import paper
 from hiernav.report.book import Book, Group, curve
-from hiernav.reproduce.experiments import ROBOTS, WORLDS
+from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, WORLDS
 from hiernav.reproduce.results import Result, drive_of
 from hiernav.sim.layout import parse_world
 
@@ -74,7 +74,7 @@ def _paper_table3(book: Book) -> Finding:
     missed, met, missing = [], 0, []
     for world in paper.TABLE3:
         best_reach, best_steps = paper.best_of_table3(world)
-        groups = [book.group("table3", v, paper.TABLE3_ROBOT, world) for v in ("shipped", "ours", "shipped-finetuned",
+        groups = [book.group("table3", v, TABLE3_ROBOT, world) for v in ("shipped", "ours", "shipped-finetuned",
                                                                                "finetuned")]  # fmt: skip
         pairs = [(g.estimate("reach_rate", "paper"), g.estimate("steps_mean", "paper")) for g in groups]
         known = [(reach.mean, steps.mean) for reach, steps in pairs if reach is not None and steps is not None]

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import cv2
 
-from hiernav.report import figures, paper, tables
+from hiernav.report import figures, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
-from hiernav.reproduce.experiments import DEPARTURE_WORLDS, EXPERIMENTS, ROBOTS, WORLDS
+from hiernav.reproduce.experiments import DEPARTURE_WORLDS, EXPERIMENTS, ROBOTS, TABLE3_ROBOT, WORLDS
 from hiernav.run import write_atomically
 
 FILM_LIMIT = 120_000
@@ -81,7 +81,7 @@ def _table3(book: Book) -> str:
     for robot in reversed(ROBOTS):
         both = f"<h3>{robot}: reach rate</h3>{tables.table3(book, robot, 'reach_rate')}"
         both += f"<h3>{robot}: steps to the goal</h3>{tables.table3(book, robot, 'steps_mean')}"
-        parts.append(both if robot == paper.TABLE3_ROBOT else f"<details><summary>{robot}</summary>{both}</details>")
+        parts.append(both if robot == TABLE3_ROBOT else f"<details><summary>{robot}</summary>{both}</details>")
     return "".join(parts) + _command("--only table3")
 
 

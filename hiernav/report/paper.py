@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from hiernav.reproduce.experiments import TABLE3_ROBOT
+
 TABLE2 = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
 """Table II: samples -> collisions in an episode, 1000 episodes."""
 
@@ -13,8 +15,7 @@ TABLE3 = {
     "two-room": ((0.37, 397.1), (0.59, 268.4), (0.99, 59.0)),
     "four-room": ((0.67, 231.7), (0.90, 64.6), (0.98, 50.6)),
 }
-"""Table III: world -> reach rate and steps to the goal of each variant; the doggo, 200 episodes."""
-TABLE3_ROBOT = "doggo"
+"""Table III: world -> reach rate and steps to the goal of each variant; of `TABLE3_ROBOT`, 200 episodes."""
 
 STEPS_BETWEEN_PLANS = 8.5
 """Mean, of the rule; figure "Training curves comparison among different frequencies", the doggo."""

@@ -223,7 +223,8 @@ def test_the_catalogue_is_whole_and_in_an_order_that_can_be_run(size):
         assert len(seeds) == {"point": 5, "car": 5, "doggo": 3}[robot]
         for variant in ("baseline", "ours", "finetuned"):
             worlds = [c.world for c in cells if (c.experiment, c.robot, c.variant) == ("table3", robot, variant)]
-            assert set(worlds) == set(size.worlds) and len(worlds) == len(size.worlds) * len(seeds)
+            count = len(seeds) if robot == "doggo" else 0
+            assert sorted(worlds) == sorted(size.worlds * count), "the paper's Table III is of the quadruped"
     assert {each.seed for each in catalogue(ROOT, size, seeds=4)} == {None, 0, 1, 2, 3}
     assert {each.robot for each in catalogue(ROOT, size, robots=["car"])} == {"car"}
 
@@ -232,7 +233,8 @@ def test_an_ablation_differs_from_ours_and_its_folder_too():
     cells = catalogue(ROOT, seeds=1)
     for robot in ROBOTS:
         trained = [c for c in cells if c.robot == robot and c.kind == "train" and c.experiment != "planners"]
-        assert len({c.config for c in trained}) == len({c.run for c in trained}) == len(trained) > 5
+        assert len({c.config for c in trained}) == len({c.run for c in trained}) == len(trained) >= 2
+    assert {c.robot for c in cells if c.experiment == "ablations" and c.kind == "train"} == {"car", "doggo"}
 
 
 def test_what_needs_no_training_can_be_had_alone():
