@@ -194,6 +194,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     report.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="(results)")
     report.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="(report.html)")
+    report.add_argument(
+        "--curves", type=Path, metavar="FILE", help="draw the training curves of all robots as well (PNG, SVG or PDF)"
+    )
     report.set_defaults(run=_report)
 
     world = commands.add_parser(
@@ -467,6 +470,11 @@ def _report(arguments: argparse.Namespace) -> int:
     failed = sum(result.state == "failed" for result in book.results)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {size:.2f} MB; {len(book.results)} results, {failed} of them failed cells")
+    if arguments.curves:
+        from hiernav.report.figures import save_training
+
+        save_training(book, arguments.curves)
+        print(f"wrote {arguments.curves}")
     for line in book.damaged:
         print(f"damaged: {line}", file=sys.stderr)
     return FAILED if book.damaged else 0

@@ -6,6 +6,7 @@ import io
 import math
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -67,27 +68,39 @@ def table2(book: Book) -> str | None:
 
 def training(book: Book, robot: str, name: str, what: str) -> str | None:
     """One value of the evaluations during training against environment steps, every seed a line."""
-    groups = {variant: book.group("sample_efficiency", variant, robot) for variant in ("ours", "baseline")}
-    if not any(group.done for group in groups.values()):
+    if not any(book.group("sample_efficiency", variant, robot).done for variant in ("ours", "baseline")):
         return None
 
     def draw(axes: Axes) -> None:
-        for variant, color in (("ours", OURS), ("baseline", BASELINE)):
-            curves = [curve(result, name) for result in groups[variant].done]
-            for steps, values in curves:
-                axes.plot(steps / 1e3, values, color=color, alpha=0.35, linewidth=0.9)
-            if curves:
-                shortest = min(len(steps) for steps, _ in curves)
-                mean = np.mean([values[:shortest] for _, values in curves], axis=0)
-                label = f"{variant} ({len(curves)} {'seed' if len(curves) == 1 else 'seeds'})"
-                axes.plot(curves[0][0][:shortest] / 1e3, mean, color=color, linewidth=2.2, label=label)
-        if name == "reach_rate":
-            axes.axhline(0.9, color=PAPER, linewidth=0.8, linestyle=":")
-            axes.set_ylim(-0.02, 1.02)
-        axes.set(xlabel="environment steps [thousands]", ylabel=what, title=robot)
-        axes.legend()
+        _draw_training(axes, book, robot, name, what)
 
     return _svg(f"training-{robot}-{name}", draw, f"{what} during training of the {robot}")
+
+
+def save_training(book: Book, out: Path) -> None:
+    """Reach rates during the trainings of all robots side by side, as a picture (PNG, SVG or PDF, by its name)."""
+    figure = Figure(figsize=(11.0, 3.2), dpi=110, layout="constrained")
+    for robot, axes in zip(ROBOTS, figure.subplots(1, len(ROBOTS), sharey=True), strict=True):
+        _draw_training(axes, book, robot, "reach_rate", "reach rate" if robot == ROBOTS[0] else "")
+    figure.savefig(out)
+
+
+def _draw_training(axes: Axes, book: Book, robot: str, name: str, what: str) -> None:
+    for variant, color in (("ours", OURS), ("baseline", BASELINE)):
+        curves = [curve(result, name) for result in book.group("sample_efficiency", variant, robot).done]
+        for steps, values in curves:
+            axes.plot(steps / 1e3, values, color=color, alpha=0.35, linewidth=0.9)
+        if curves:
+            shortest = min(len(steps) for steps, _ in curves)
+            mean = np.mean([values[:shortest] for _, values in curves], axis=0)
+            label = f"{variant} ({len(curves)} {'seed' if len(curves) == 1 else 'seeds'})"
+            axes.plot(curves[0][0][:shortest] / 1e3, mean, color=color, linewidth=2.2, label=label)
+    if name == "reach_rate":
+        axes.axhline(0.9, color=PAPER, linewidth=0.8, linestyle=":")
+        axes.set_ylim(-0.02, 1.02)
+    axes.set(xlabel="environment steps [thousands]", ylabel=what, title=robot)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False)
 
 
 def reach(book: Book, robot: str) -> str | None:

@@ -163,6 +163,17 @@ def test_a_curve_has_a_line_for_every_seed(book):
     assert "ours (2 seeds)" in figure and ">reach rate<" in figure
 
 
+def test_the_curves_are_drawn_as_a_picture_too(results, tmp_path, capsys):
+    out = tmp_path / "curves.png"
+    arguments = ["report", "--results", str(results), "--out", str(tmp_path / "page.html"), "--curves", str(out)]
+    assert cli.main(arguments) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    picture = cv2.imread(str(out))
+    ours = np.abs(picture.astype(int) - (0xC4, 0x82, 0x3B)).max(axis=-1) < 12
+    panels = np.array_split(ours, 3, axis=1)
+    assert all(panel.sum() > 100 for panel in panels)
+
+
 def test_small_films_are_in_the_page_and_large_ones_are_links(results, tmp_path):
     folder = tmp_path / "results"
     cells = [cell for cell in made_up.CELLS.values() if cell.kind == "film"][:2]
