@@ -432,7 +432,7 @@ class HierarchicalAgent:
         plan = self.recovery(pose, step.plan, occupancy)
         self.option.waiting |= self.recovery.ended
         time_ = self._steps * self.control_period if self._clocked else None
-        observation = self.layout.build(guided(terms, pose, plan, goal, time_))
+        observation = self.layout.build(guided(self.recovery.dim(terms), pose, plan, goal, time_))
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
 

@@ -16,6 +16,7 @@ import numpy as np
 from hiernav.nav.bundle import Bundle
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import Planner, PlanQuery, kept
+from hiernav.nav.path import distances
 from hiernav.nav.recovery import Recovery
 from hiernav.runtime.about import About
 from hiernav.runtime.estimate import Estimate
@@ -199,14 +200,19 @@ class Replay:
 
 
 class _Recorded(Recovery):
-    """In the place of the recovery, which hangs on more than was recorded: gives what it gave."""
+    """In the place of the recovery, which hangs on more than was recorded: gives what it gave, where it gave it."""
 
     plan: np.ndarray | None = None
 
     def __call__(
         self, pose: np.ndarray, plan: np.ndarray, occupancy: Sequence[OccupancyMap], rows: np.ndarray | None = None
     ) -> np.ndarray:
-        return plan if self.plan is None else self.plan[None]
+        self._tries[distances(pose[:, :2], self._place) > self.clear_m] = 0
+        if self.plan is None:
+            return plan
+        if self._tries[0] == 0:
+            self._place[0], self._tries[0], self._quiet = pose[0, :2], 1, False
+        return self.plan[None]
 
 
 class _Asked(Planner):

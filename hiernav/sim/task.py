@@ -184,9 +184,9 @@ class NavigationTask:
             plan = self.recovery(pose, plan, maps, rows)
             self.option.waiting |= self.recovery.ended
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
-        values = guided(sensors, pose, plan, goal, self.steps[pick] * self.robot.control_period)
-        values["lidar"] = lidar_closeness(pose, self._discs[pick])
-        built = self.layout.build(values)
+        sensors["lidar"] = lidar_closeness(pose, self._discs[pick])
+        seen = sensors if self.recovery is None else self.recovery.dim(sensors, rows)
+        built = self.layout.build(guided(seen, pose, plan, goal, self.steps[pick] * self.robot.control_period))
         if not np.isfinite(built).all():
             built = np.nan_to_num(built)  # a broken row is reported, not passed on
         if rows is None:

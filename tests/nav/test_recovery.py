@@ -84,6 +84,23 @@ def test_coming_clear_of_the_place_gives_new_tries() -> None:
     assert sum(drive(recovery, np.full((14 * WINDOW, 2), (0.6, 0.0)), FAR)) == 3 * DURATION
 
 
+def test_obstacles_look_farther_away_until_a_robot_that_stood_is_clear_of_the_place() -> None:
+    recovery, terms = Recovery(2, PERIOD), {"lidar": np.full((2, 10), 0.5), "gyro": np.ones((2, 3))}
+    plan, away = np.repeat(AHEAD, 2, axis=0), np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 0.0]])
+    for t in range(WINDOW + 1):
+        assert recovery.dim(terms) is terms
+        recovery(away + [[0.0, 0.0, 0.0], [0.1 * t, 0.0, 0.0]], plan, [FREE, FREE])
+    dimmed = recovery.dim(terms)
+    assert_allclose(dimmed["lidar"], np.repeat([[0.35], [0.5]], 10, axis=1))
+    assert dimmed["gyro"] is terms["gyro"] and (terms["lidar"] == 0.5).all()
+    one = np.array([1])
+    assert (recovery.dim({"lidar": np.full((1, 10), 0.5)}, one)["lidar"] == 0.5).all()
+    recovery(np.array([[0.45, 0.0, 0.0], [9.0, 9.0, 0.0]]), plan, [FREE, FREE])
+    assert_allclose(recovery.dim(terms)["lidar"][0], 0.35)
+    recovery(np.array([[0.55, 0.0, 0.0], [9.5, 9.0, 0.0]]), plan, [FREE, FREE])
+    assert (recovery.dim(terms)["lidar"] == 0.5).all()
+
+
 def test_each_robot_is_watched_for_itself_and_a_reset_forgets() -> None:
     recovery = Recovery(2, PERIOD)
     plan, helped = np.repeat(FAR, 2, axis=0), []
