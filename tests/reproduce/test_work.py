@@ -120,8 +120,8 @@ def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result
 
 @pytest.mark.train
 def test_the_command_trains_drives_and_films_and_does_not_repeat_itself(tmp_path):
-    wanted = ("--smoke", "--robots", "point", "--results", tmp_path / "results", "--runs", tmp_path / "runs",
-              "--only", "table3/point-*-pillar*", "films/*-2", "table2/*-16-0")  # fmt: skip
+    wanted = ("--smoke", "--seeds", "1", "--results", tmp_path / "results", "--runs", tmp_path / "runs",
+              "--only", "table3/doggo-*-pillar*", "films/point-*-2", "table2/*-16-0")  # fmt: skip
     listed = json.loads(reproduce(*wanted, "--list", "--json").stdout)
     done = reproduce(*wanted, "--json")
     assert done.returncode == 0, done.stderr
