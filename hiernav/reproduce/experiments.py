@@ -82,7 +82,7 @@ TRAINING = {
 """Departures that have to be trained without (`layer-norm` and `learned-plans`: with). One that changes nothing for a
 robot is left out for it."""
 OF_LEGS = ("no-tilt-cost", "go-on-after-fall", "no-clock", "no-time-cost")
-"""Departures that are the quadruped's alone."""
+"""Departures that are left out with the quadruped instead."""
 BASELINE = ["skill.preset=baseline", "skill.reward_scale=1.0", "reward.time=0"]
 """Its rewards are as large as ours after scaling: every step costs the distance to the goal."""
 
