@@ -59,7 +59,7 @@ class PathField:
         # by how much more must fit where a line is looked at, so that the disc fits in between
         self._slack = math.hypot(radius, 0.5 * _SAMPLE) - radius
         self._centers, self._shape = _cell_centers(occupancy)
-        clearance = occupancy.clearance_at(self._centers)
+        self._clearance = clearance = occupancy.clearance_at(self._centers)
         self._free = clearance >= radius
         self._cost, self._next = np.full(len(self._free), np.inf), np.full(len(self._free), -1)
         self.goal_cell = _nearest(self._centers, self._free, self.goal)
@@ -98,7 +98,7 @@ class PathField:
         vertices = self._centers[cells]
         if cell == self.goal_cell:
             vertices = np.concatenate([vertices[:-1], self._end[None]])
-        if len(cells) > 1 and cells[0] == own and not self._led_astray(start, vertices[1]):
+        if len(cells) > 1 and cells[0] == own and not self._led_astray(start, own, vertices[1]):
             vertices = vertices[1:]  # the centre of the start's own cell may lie behind it
         return np.concatenate([start[None], vertices])
 
@@ -162,11 +162,14 @@ class PathField:
                 points[row] = moved[fits[0]]
         return points
 
-    def _led_astray(self, start: np.ndarray, vertex: np.ndarray) -> bool:
-        """Whether a straight line to a vertex takes room from a disc that has it at the start."""
-        return bool(
-            self.occupancy.clearance_at(start) >= self.radius and not self._visible(start[None], vertex[None])[0]
-        )
+    def _led_astray(self, start: np.ndarray, own: int, vertex: np.ndarray) -> bool:
+        """Whether a straight line from a start in cell `own` to a vertex beside it takes room that a disc has there."""
+        if self._clearance[own] >= self.radius + 2.0 * CELL:
+            return False
+        delta = vertex - start
+        t = np.linspace(0.0, 1.0, math.ceil(math.hypot(*delta) / _SAMPLE) + 2)
+        clearance = self.occupancy.clearance_at(start + t[:, None] * delta)
+        return bool(clearance[0] >= self.radius and clearance.min() < self.radius + self._slack)
 
     def _visible(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         return np.isfinite(self.line_cost(begin, end))
