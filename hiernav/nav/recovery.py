@@ -108,7 +108,7 @@ class Recovery:
         self._trail[rows, slot] = position
         if self._quiet and not np.count_nonzero(still):
             return plan
-        self._tries[rows[distances(position, self._place[rows]) > self.clear_m]] = 0
+        self._forget(rows, position)
         ahead = distances(plan[:, -1], position)
         idle = self._ways_left[rows] == 0
         stuck = (still & (ahead > self.least_m) | self._asked[rows]) & idle
@@ -141,15 +141,23 @@ class Recovery:
         dimmed = self._tries > 0 if rows is None else self._tries[rows] > 0
         return {**terms, "lidar": np.where(dimmed[:, None], _DIMMED * terms["lidar"], terms["lidar"])}
 
-    def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
+    def _forget(self, rows: np.ndarray, position: np.ndarray) -> None:
+        """Recoveries count in one place alone."""
+        self._tries[rows[distances(position, self._place[rows]) > self.clear_m]] = 0
+
+    def _remember(self, row: int, position: np.ndarray) -> None:
+        """One more recovery; the first one makes the place."""
         if self._tries[row] == 0:
-            self._place[row] = pose[:2]
+            self._place[row] = position
+        self._tries[row] += 1
+
+    def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
         ways = ways_out(pose, plan, occupancy, self.radius)
         first = int(self._tries[row]) * self.ways % len(ways)  # go on where the last recovery in this place ended
         self._out[row] = [*ways[first:], *ways[:first]]
         self._began[row] = self._turned[row] = pose[:2]
         self._trail[row], self._ways_left[row], self._on_way[row] = np.nan, self.ways, 0
-        self._tries[row] += 1
+        self._remember(row, pose[:2])
         self.counts[row] += 1
 
     def _go_on(self, row: int, position: np.ndarray) -> None:

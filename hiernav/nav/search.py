@@ -166,10 +166,8 @@ class PathField:
         """Whether a straight line from a start in cell `own` to a vertex beside it takes room that a disc has there."""
         if self._clearance[own] >= self.radius + 2.0 * CELL:
             return False
-        delta = vertex - start
-        t = np.linspace(0.0, 1.0, math.ceil(math.hypot(*delta) / _SAMPLE) + 2)
-        clearance = self.occupancy.clearance_at(start + t[:, None] * delta)
-        return bool(clearance[0] >= self.radius and clearance.min() < self.radius + self._slack)
+        has_room = self.occupancy.clearance_at(start) >= self.radius
+        return bool(has_room and not self._visible(start[None], vertex[None])[0])
 
     def _visible(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         return np.isfinite(self.line_cost(begin, end))

@@ -16,7 +16,6 @@ import numpy as np
 from hiernav.nav.bundle import Bundle
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import Planner, PlanQuery, kept
-from hiernav.nav.path import distances
 from hiernav.nav.recovery import Recovery
 from hiernav.runtime.about import About
 from hiernav.runtime.estimate import Estimate
@@ -157,6 +156,7 @@ class Replay:
             recovered = self._mode is Mode.RECOVERING and event.values.get("mode") == Mode.RUNNING.value
             self._waits |= recovered
             self._mode = Mode(event.values["mode"])
+            self._recovery.active[0] &= self._mode is Mode.RECOVERING
 
     def _values(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
         """Name, recorded and replayed value of everything that was computed in a tick."""
@@ -207,12 +207,12 @@ class _Recorded(Recovery):
     def __call__(
         self, pose: np.ndarray, plan: np.ndarray, occupancy: Sequence[OccupancyMap], rows: np.ndarray | None = None
     ) -> np.ndarray:
-        self._tries[distances(pose[:, :2], self._place) > self.clear_m] = 0
-        if self.plan is None:
-            return plan
-        if self._tries[0] == 0:
-            self._place[0], self._tries[0], self._quiet = pose[0, :2], 1, False
-        return self.plan[None]
+        position, begins = pose[:, :2], self.plan is not None and not self.active[0]
+        self._forget(np.zeros(1, dtype=np.intp), position)
+        if begins:
+            self._remember(0, position[0])
+        self.active[0], self._quiet = self.plan is not None, not self._tries.any()
+        return plan if self.plan is None else self.plan[None]
 
 
 class _Asked(Planner):

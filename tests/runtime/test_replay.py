@@ -12,11 +12,13 @@ from recorded_drive import BUNDLE, about, drive
 
 from hiernav import cli
 from hiernav.nav.bundle import Bundle, load_bundle
+from hiernav.nav.occupancy import empty_map
+from hiernav.nav.recovery import Recovery
 from hiernav.runtime.log_reader import LogError, RunLog
 from hiernav.runtime.observe import Observer
 from hiernav.runtime.policy import OnnxSkill
 from hiernav.runtime.recorder import Recorder
-from hiernav.runtime.replay import Replay
+from hiernav.runtime.replay import Replay, _Recorded
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise
 from hiernav.runtime.supervisor import Mode
@@ -144,3 +146,22 @@ def test_the_command_says_equal_different_or_refused(tmp_path, capsys):
     (tmp_path / "cut.mcap").write_bytes(good.path.read_bytes()[:100])
     assert cli.main(["replay", str(tmp_path / "cut.mcap")]) == 2
     assert "not a recording" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_lidar_is_dimmed_where_it_was(seed: int) -> None:
+    """A robot that stands, is shown ways out, moves on them or does not, and comes clear of the place at any time."""
+    rng, free = np.random.default_rng(seed), empty_map((20.0, 20.0))
+    recovery, replayed = Recovery(1, 0.1), _Recorded(1, 0.1)
+    plan, terms = 0.1 * np.ones((1, 10, 2)) * np.arange(1, 11)[:, None], {"lidar": np.full((1, 10), 0.5)}
+    pose, speed, dimmed = np.zeros((1, 3)), 0.0, 0
+    for _ in range(600):
+        if rng.random() < 0.08:
+            speed = rng.choice([0.0, 0.0, 0.05, 0.2])
+        pose[0, :2] = np.clip(pose[0, :2] + speed * rng.choice([-1.0, 1.0], p=[0.3, 0.7], size=2), -9.0, 9.0)
+        followed = recovery(pose, plan + pose[:, None, :2], [free])
+        replayed.plan = followed[0] if recovery.active[0] else None
+        assert (replayed(pose, plan + pose[:, None, :2], [free]) == followed).all()
+        assert (recovery.dim(terms)["lidar"] == replayed.dim(terms)["lidar"]).all()
+        dimmed += int((recovery.dim(terms)["lidar"] < 0.5).any())
+    assert 0 < dimmed < 600
