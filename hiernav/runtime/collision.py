@@ -35,14 +35,14 @@ def time_to_collision(
     (x, y), (dx, dy) = position, (velocity[0] / speed, velocity[1] / speed)
     field, resolution, (x0, y0) = occupancy.clearance, occupancy.resolution, occupancy.origin
     rows, cols = field.shape
-    limit, travelled, before = speed * horizon, 0.0, -1.0
+    limit, travelled = speed * horizon, 0.0
+    before = math.inf  # clearance at the step before, where that met an obstacle
     while travelled <= limit:
         row, col = int((y + travelled * dy - y0) / resolution), int((x + travelled * dx - x0) / resolution)
         clearance = float(field[row, col]) if 0 <= row < rows and 0 <= col < cols else 0.0
         room = clearance - radius
-        if room <= 0.0:
-            if clearance < before or (clearance == 0.0 and travelled > 0.0):
-                return travelled / speed
-            before = clearance
+        if room <= 0.0 and travelled > 0.0 and (clearance < before or clearance == 0.0):
+            return max(travelled + room, 0.0) / speed
+        before = clearance if room <= 0.0 else math.inf
         travelled += max(room, _LEAST_STEP)
     return math.inf
