@@ -107,3 +107,9 @@ class Estimate:
     restarts: int = 0
     """How often position or heading were far off (`reinit_spread`) and started again, as after being carried away.
     Plans made before are void."""
+
+    def body_velocity(self) -> tuple[float, float]:
+        """Forward and left, heading frame [m/s]."""
+        (vx, vy), yaw = self.velocity.tolist(), float(self.pose[2])
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        return cosine * vx + sine * vy, cosine * vy - sine * vx

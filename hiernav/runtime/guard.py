@@ -29,6 +29,12 @@ class GuardConfig:
     """Below this time to collision with the known map commands are scaled down in proportion [s]; None never does."""
     slowed: tuple[int, ...] | None = None
     """Actuators that are scaled, those that make the robot faster; all if None."""
+    saturation: float | None = None
+    """Command of these beyond which the robot gets no faster: what is scaled is at most that; None where there is none.
+    """
+    drive: float | None = None
+    """Bearing in the body frame towards which they drive the robot together [rad]: what they have in common is scaled,
+    unless it brakes, and what they differ by, which turns it, is left. None scales every command by itself."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= 0.0 <= self.high):
@@ -39,6 +45,10 @@ class GuardConfig:
             raise ValueError(f"GuardConfig.tilt_limit = {self.tilt_limit} rad must be in (0, pi], or None")
         if self.slow_ttc is not None and not 0.0 < self.slow_ttc < math.inf:
             raise ValueError(f"GuardConfig.slow_ttc = {self.slow_ttc} s must be finite and positive, or None")
+        if self.saturation is not None and not 0.0 < self.saturation < math.inf:
+            raise ValueError(f"GuardConfig.saturation = {self.saturation} must be finite and positive, or None")
+        if self.drive is not None and not math.isfinite(self.drive):
+            raise ValueError(f"GuardConfig.drive = {self.drive} rad must be finite, or None")
         for name in ("max_non_finite", "max_tilted"):
             if getattr(self, name) < 1:
                 raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be at least 1")
@@ -79,12 +89,21 @@ class Guard:
 
     def reset(self) -> None:
         """A new run begins from standstill; counts are kept."""
-        self._last = [0.0] * self.action_dim
+        self.braked()
         self._non_finite = 0
         self._tilted = 0
 
+    def braked(self) -> None:
+        """The robot got the brake, past this guard: what follows starts from zero."""
+        self._last = [0.0] * self.action_dim
+
     def check(
-        self, action: np.ndarray, upright: float | None = None, ttc: float = math.inf, speed: float = 1.0
+        self,
+        action: np.ndarray,
+        upright: float | None = None,
+        ttc: float = math.inf,
+        speed: float = 1.0,
+        velocity: tuple[float, float] = (0.0, 0.0),
     ) -> Guarded:
         """Make `action` safe to send.
 
@@ -93,6 +112,7 @@ class Guard:
             upright: z component of the body's z axis; None where it is not known. NaN counts as fallen.
             ttc: time to collision with the known map [s].
             speed: factor in [0, 1] by which the robot is to be slowed down for another reason.
+            velocity: forward and left, in the body's frame [m/s]; tells what `GuardConfig.drive` spares.
         """
         fault = self._tilt_fault(upright)
         if fault is not None:
@@ -111,8 +131,7 @@ class Guard:
             self.counts["clipped"] += 1
         scale = self._scale(ttc, speed)
         if scale < 1.0:
-            for k in self._slowed:
-                limited[k] *= scale
+            self._slow(limited, scale, velocity)
         if slew is not None:
             steady = [min(max(v, last - slew), last + slew) for v, last in zip(limited, self._last, strict=True)]
             if steady != limited:
@@ -120,6 +139,20 @@ class Guard:
             limited = steady
         self._last = limited
         return Guarded(np.array(limited), scale=scale)
+
+    def _slow(self, action: list[float], scale: float, velocity: tuple[float, float]) -> None:
+        """Scale what makes the robot faster, in place."""
+        most, drive = self.config.saturation or math.inf, self.config.drive
+        held = {k: min(max(action[k], -most), most) for k in self._slowed}
+        if drive is None:
+            for k, value in held.items():
+                action[k] = scale * value
+            return
+        common = sum(held.values()) / max(len(held), 1)
+        if common * (velocity[0] * math.cos(drive) + velocity[1] * math.sin(drive)) < 0.0:
+            return
+        for k, value in held.items():
+            action[k] = value - (1.0 - scale) * common
 
     def _scale(self, ttc: float, speed: float) -> float:
         if speed < 1.0:
@@ -154,5 +187,5 @@ class Guard:
 
     def _brake(self) -> np.ndarray:
         # The stop is not slewed; what follows it starts from zero again.
-        self._last = [0.0] * self.action_dim
+        self.braked()
         return np.zeros(self.action_dim)

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shipped import ROOT
 
 from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.settings import load_settings
+from hiernav.runtime.sim_robot import EXACT, SimRobot
+from hiernav.sim.robots import get_robot
+from hiernav.sim.worlds import parse_world, sample_layout
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 actions = st.lists(anything, min_size=3, max_size=3).map(np.array)
@@ -117,3 +122,60 @@ def test_a_new_run_starts_with_a_clean_slate():
 def test_limits_that_would_switch_the_guard_off_are_refused(settings):
     with pytest.raises(ValueError, match="GuardConfig"):
         GuardConfig(**settings)
+
+
+DRIVE = GuardConfig(slow_ttc=1.0, saturation=0.02, drive=-math.pi / 2)
+"""Of two wheels that drive the robot to its right."""
+
+
+def test_a_command_that_saturates_is_slowed_from_where_it_does():
+    guard = Guard(2, DRIVE)
+    np.testing.assert_allclose(guard.check(np.array([1.0, 1.0]), ttc=0.25).action, 0.005)
+    np.testing.assert_allclose(guard.check(np.array([0.01, 0.01]), ttc=0.5).action, 0.005)
+    np.testing.assert_array_equal(guard.check(np.array([1.0, 1.0])).action, 1.0)
+
+
+def test_what_brakes_is_not_slowed():
+    guard = Guard(2, DRIVE)
+    forward, backward = (0.0, -0.5), (0.0, 0.5)
+    np.testing.assert_array_equal(guard.check(np.array([-1.0, -1.0]), ttc=0.0, velocity=forward).action, -1.0)
+    np.testing.assert_allclose(guard.check(np.array([-1.0, -1.0]), ttc=0.0, velocity=backward).action, 0.0)
+    np.testing.assert_allclose(guard.check(np.array([1.0, 1.0]), ttc=0.0, velocity=forward).action, 0.0)
+
+
+def test_turning_is_not_slowed():
+    guard = Guard(2, DRIVE)
+    np.testing.assert_allclose(guard.check(np.array([1.0, -1.0]), ttc=0.0).action, [0.02, -0.02])
+    np.testing.assert_allclose(guard.check(np.array([1.0, 0.0]), ttc=0.0).action, [0.01, -0.01])
+
+
+@given(actions, st.floats(0.0, 1.0), st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)))
+def test_slowing_leaves_the_limits(action, speed, velocity):
+    config = GuardConfig(low=-0.5, high=0.5, slowed=(0, 2), drive=0.3)
+    sent = Guard(3, config).check(action, speed=speed, velocity=velocity).action
+    assert (np.abs(sent) <= 0.5 + 1e-12).all()
+
+
+def test_after_a_brake_from_elsewhere_commands_rise_from_zero():
+    guard = Guard(1, GuardConfig(slew_limit=0.1))
+    for _ in range(5):
+        guard.check(np.array([1.0]))
+    guard.braked()
+    np.testing.assert_allclose(guard.check(np.array([1.0])).action, 0.1)
+
+
+@pytest.mark.parametrize(("name", "full"), [("point", 1.2), ("car", 0.6)])
+def test_half_speed_is_half_the_speed_of_the_robots_that_ship(name, full):
+    """Their force saturates at a few hundredths of the largest command: halving that would change nothing."""
+
+    def speed_after(seconds: float, scale: float) -> float:
+        robot = SimRobot(get_robot(name), sample_layout(parse_world("pillar(4,4,1)"), seed=1), EXACT)
+        guard = Guard(2, load_settings(ROOT / "deploy" / f"{name}.yaml").guard)
+        action = np.array([1.0, 0.0 if name == "point" else 1.0])
+        for _ in range(round(seconds / robot.control_period)):
+            robot.send(guard.check(action, speed=scale).action)
+        return float(np.linalg.norm(robot.truth().velocity))
+
+    at_full = speed_after(2.0, 1.0)
+    assert at_full > full
+    assert 0.4 * at_full < speed_after(2.0, 0.5) < 0.7 * at_full
