@@ -234,6 +234,8 @@ class Driver:
             self.audience.tell(lambda observer: observer.flush(FLUSH_SECONDS))
             stopped = self._stop()
             if self._ended is not None:
+                if not stopped:
+                    self._does_not_stop(self.clock.now())
                 self.last_result = self._result(self._ended, stopped)
             if not self.supervisor.latched and self.supervisor.mode is not Mode.INIT:
                 self.supervisor.change(Mode.INIT, "the loop has ended", self.clock.now())
@@ -303,6 +305,7 @@ class Driver:
             sent, scale = self._send(decision, estimate, occupancy, now)
         if sent is None:
             self.robot.brake()
+            self.guard.braked()
             timer.mark("send")
             self._check_stop(estimate, now)
         timer.end()
@@ -425,7 +428,8 @@ class Driver:
         ttc = math.inf
         if slow is not None:
             ttc = time_to_collision(occupancy, (x, y), (vx, vy), self.config.robot_radius, slow)
-        guarded = self.guard.check(decision.action, estimate.upright, ttc, self._plan_speed)
+        moving = estimate.body_velocity()
+        guarded = self.guard.check(decision.action, estimate.upright, ttc, self._plan_speed, moving)
         self.timer.mark("guard")
         if guarded.fault is not None:
             self._fail(guarded.fault, now)
@@ -464,14 +468,21 @@ class Driver:
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:
         """Follow a robot that was braked until it stands; one that does not stop is a fault."""
-        stands = self._standing.check(estimate, now)
+        stands = self._standing.check(estimate, now, self._speed_is_measured())
         if stands is None:
             return
         self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
+        if not stands:
+            self._does_not_stop(now)
         if self._ended is not None and self._serving:
             self.last_result, self._ended = self._result(self._ended, stands), None
-        if not stands:
-            self._fail(f"the robot does not stop within {self.config.stop_timeout:g} s", now)
+
+    def _speed_is_measured(self) -> bool:
+        """Whether the velocimeter says something, if the robot has one."""
+        return self.estimator.silence("velocimeter") < self.estimator.config.hold_after
+
+    def _does_not_stop(self, now: float) -> None:
+        self._fail(f"the robot does not stop within {self.config.stop_timeout:g} s", now)
 
     def _fail(self, why: str, now: float) -> None:
         self.supervisor.fail(why, now)
@@ -487,8 +498,7 @@ class Driver:
         self.supervisor.acknowledge(now)
         self.guard.reset()
         self.pilot.renew()
-        config, trust = self.config, self.estimator.config
-        self._blind = BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate)
+        self._blind.renew(now)
 
     def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         self.audience.emit(kind, text, now, **values)
@@ -566,7 +576,7 @@ class Driver:
         def tick(now: float) -> bool:
             nonlocal stopped
             self._estimate = self.estimator.update(self.robot.read())
-            stopped = watch.check(self._estimate, now)
+            stopped = watch.check(self._estimate, now, self._speed_is_measured())
             if stopped is None:
                 self.robot.brake()
             return stopped is not None

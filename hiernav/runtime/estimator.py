@@ -85,6 +85,10 @@ class Estimator:
         """Whether position and heading have been measured at least once."""
         return self._has_position and self._has_yaw
 
+    def silence(self, sensor: str) -> float:
+        """For how long a sensor, such as "velocimeter", has said nothing new [s]; 0 for one never heard of."""
+        return self._watch.silence(sensor, self._stamp)
+
     def update(self, frame: SensorFrame) -> Estimate | None:
         """Take in one frame.
 

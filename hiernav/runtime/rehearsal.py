@@ -59,4 +59,4 @@ class Rehearsal:
         decision = self._pilot.act(self._stamp, estimate, self._terms.fill(frame), goal, occupancy)
         x, y, _ = estimate.pose.tolist()
         ttc = time_to_collision(occupancy, (x, y), (1.0, 0.0), self._radius, 0.5)
-        self._guard.check(decision.action, estimate.upright, ttc)
+        self._guard.check(decision.action, estimate.upright, ttc, velocity=estimate.body_velocity())

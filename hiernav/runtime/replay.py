@@ -165,11 +165,19 @@ class Replay:
         if tick.observation is not None:
             yield from self._decision(tick)
         if tick.sent is not None and tick.proposed is not None:
-            upright = None if tick.estimate is None else tick.estimate.upright
-            yield "sent", tick.sent, self._guard.check(tick.proposed, upright, speed=tick.speed_scale).action
+            yield "sent", tick.sent, self._guarded(tick, tick.proposed)
+        elif tick.sent is None:
+            self._guard.braked()
         if self._waits:
             # as after a recovery: another plan is asked for at the next tick
             self._agent.option.waiting[0], self._waits = True, False
+
+    def _guarded(self, tick: TickRecord, proposed: np.ndarray) -> np.ndarray:
+        estimate = tick.estimate
+        if estimate is None:
+            return self._guard.check(proposed, speed=tick.speed_scale).action
+        velocity = estimate.body_velocity()
+        return self._guard.check(proposed, estimate.upright, speed=tick.speed_scale, velocity=velocity).action
 
     def _decision(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
         if tick.estimate is None or tick.goal is None or tick.occupancy is None:

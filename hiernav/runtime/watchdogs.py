@@ -24,6 +24,11 @@ class BlindWatch:
         self._since: float | None = None
         self._stamp = -math.inf
 
+    def renew(self, now: float) -> None:
+        """Give the first estimate its time once more; one that has grown old stays old until another comes."""
+        if math.isinf(self._stamp):
+            self._since = now
+
     def check(self, estimate: Estimate | None, now: float) -> tuple[Trust, str]:
         """What the newest estimate is good for at `now` [s], on the loop's clock, and what it suffers from."""
         if self._since is None:
@@ -33,7 +38,7 @@ class BlindWatch:
             if math.isinf(self._stamp):
                 why = f"no position and heading for {waited:.2f} s"
                 return (Trust.LOST if waited > self.first_after else Trust.HOLD), why
-        elif estimate.stamp > self._stamp:
+        elif estimate.stamp != self._stamp:  # earlier after the robot's clock was started again
             self._since, self._stamp = now, estimate.stamp
             return estimate.trust, estimate.why
         age = now - self._since
@@ -153,17 +158,26 @@ class StopWatch:
         self.speed, self.timeout, self.readings = speed, timeout, readings
         self._since: float | None = None
         self._slow = 0
+        self._stamp = math.nan
 
     def begin(self, now: float) -> None:
         """The brake was first sent at `now` [s]."""
         self._since, self._slow = now, 0
 
-    def check(self, estimate: Estimate | None, now: float) -> bool | None:
-        """Whether the robot stands; None while that is open, and after it was told once."""
+    def check(self, estimate: Estimate | None, now: float, measured: bool = True) -> bool | None:
+        """Whether the robot stands; None while that is open, and after it was told once.
+
+        Args:
+            estimate: newest; one that was seen before says nothing.
+            now: on the loop's clock [s].
+            measured: whether its speed is one that a sensor says, and not the last one that was known.
+        """
         if self._since is None:
             return None
-        moving = estimate is None or not math.hypot(*estimate.velocity.tolist()) < self.speed
-        self._slow = 0 if moving else self._slow + 1
+        if estimate is None or not math.hypot(*estimate.velocity.tolist()) < self.speed:
+            self._slow = 0
+        elif measured and estimate.stamp != self._stamp:
+            self._slow, self._stamp = self._slow + 1, estimate.stamp
         if self._slow >= self.readings:
             self._since = None
             return True

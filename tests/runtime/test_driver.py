@@ -20,6 +20,7 @@ from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import Episode, print_summary, summarise
 from hiernav.runtime.supervisor import InvalidTransition, Mode
 from hiernav.runtime.terms import TermHold
+from hiernav.runtime.trip import RunResult
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import parse_world, sample_layout
 
@@ -105,11 +106,92 @@ def test_a_keyboard_interrupt_stops_the_robot():
     assert driver.supervisor.mode is Mode.INIT
 
 
-def test_a_robot_that_does_not_stop_is_reported():
+def test_a_robot_that_does_not_stop_is_a_fault():
     robot = Puck(stops=False)
-    result = driver_of(robot, config=DriverConfig(stop_timeout=1.0)).run(GOAL)
+    driver = driver_of(robot, config=DriverConfig(stop_timeout=1.0))
+    result = driver.run(GOAL)
     assert result.reached and not result.stopped
+    assert result.fault == "the robot does not stop within 1 s"
+    assert driver.supervisor.mode is Mode.FAULT
     assert robot.log[-1] == "brake"
+
+
+def test_a_robot_that_does_not_stop_while_it_serves_is_a_fault_of_that_goal():
+    results: list[RunResult | None] = []
+
+    class Watcher(Observer):
+        def tick(self, record: TickRecord) -> None:
+            if record.index == 1:
+                driver.set_goal(GOAL)
+            elif driver.last_result is not None:
+                results.append(driver.last_result)
+                driver.quit()
+
+    driver = driver_of(Puck(stops=False), config=DriverConfig(stop_timeout=0.5), observers=[Watcher()])
+    driver.serve()
+    assert results[0] is not None
+    assert results[0].reason == "goal" and not results[0].stopped
+    assert results[0].fault == "the robot does not stop within 0.5 s"
+
+
+@pytest.mark.parametrize("silent", ["all", "velocimeter"])
+def test_a_robot_whose_speed_is_not_measured_is_not_shown_to_stand(silent):
+    """Frames that do not change, or have no velocity any more, say nothing about a robot that was slow before."""
+    last: list[SensorFrame] = []
+
+    def sees(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < 1.25:
+            last[:] = [frame]
+        return last[0] if silent == "all" else replace(frame, velocimeter=None if frame.stamp > 1.25 else np.zeros(3))
+
+    slow = Scripted(lambda step, straight: np.array([0.05, 0.0]))
+    result = driver_of(Puck(sees=sees), slow).run(GOAL)
+    assert result.reason == "fault" and not result.stopped
+
+
+def test_a_fault_that_is_acknowledged_does_not_make_dead_sensors_good():
+    frozen: list[SensorFrame] = []
+
+    def freeze(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp > 0.55:
+            frozen.append(frame)
+            return frozen[0]
+        return frame
+
+    robot, modes = Puck(sees=freeze), []
+
+    class Watcher(Observer):
+        def tick(self, record: TickRecord) -> None:
+            modes.append(record.mode)
+            if record.index == 1:
+                driver.set_goal(GOAL)
+            elif len(modes) > 1 and modes[-1] is Mode.FAULT is not modes[-2]:
+                robot.sent.clear()
+                driver.acknowledge()
+                driver.set_goal(GOAL)
+            elif record.index == 100:
+                driver.quit()
+
+    driver = driver_of(robot, observers=[Watcher()])
+    driver.serve()
+    assert modes.count(Mode.FAULT) > 1 and robot.sent == []
+
+
+def test_a_robot_that_waited_starts_again_from_rest():
+    robot, before = Puck(), []
+
+    class Watcher(Observer):
+        def tick(self, record: TickRecord) -> None:
+            if record.index == 12:
+                driver.pause()
+            elif record.index == 16:
+                before.extend(robot.sent)
+                driver.resume()
+
+    driver = driver_of(robot, guard=Guard(2, GuardConfig(slew_limit=0.05)), observers=[Watcher()])
+    driver.run(GOAL)
+    assert before[-1][0] > 0.3
+    assert robot.sent[len(before)][0] <= 0.05
 
 
 def test_a_robot_that_does_not_know_where_it_is_stays_braked():
