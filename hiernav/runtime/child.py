@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,8 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 class Child:
     """A Python process that runs a module of this package, of this process's kin and in a session of its own.
 
-    A terminal's Ctrl-C does not reach it: it ends when its `news` pipe is closed, be it by `close` or because this
-    process is gone.
+    A terminal's Ctrl-C does not reach it, and it leaves signals to this process (`leave_signals_to_parent`): it ends
+    when its `news` pipe is closed, be it by `close` or because this process is gone.
     """
 
     def __init__(
@@ -65,6 +66,12 @@ class Child:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+
+def leave_signals_to_parent() -> None:
+    """In the child: SIGINT and SIGTERM, which may be sent to all processes at once, are for the parent to act upon."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def wait_for_news(news: int, timeout: float | None) -> bytes | None:

@@ -19,7 +19,7 @@ import scipy.sparse.csgraph  # noqa: F401  by the first search, which the keeper
 from hiernav.nav.goselo import CHANNELS
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner, verified_planner
-from hiernav.runtime.child import wait_for_news
+from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import mapped
 from hiernav.runtime.planner_memory import PlannerMemory, Reply
 from hiernav.runtime.policy import OnnxPlannerNetwork
@@ -30,7 +30,7 @@ RESTART, FORGIVE = b"r", b"f"
 
 def main() -> None:
     news, questions, descriptor = map(int, sys.argv[1:4])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals_to_parent()
     keep(news, questions, PlannerMemory(mapped(descriptor)))
 
 

@@ -11,7 +11,6 @@ import importlib.util
 import json
 import os
 import select
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hiernav.runtime.child import wait_for_news
+from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import Mailbox, mapped
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot
@@ -37,9 +36,10 @@ LAST_BRAKES = 1.0
 
 def main() -> None:
     news, calls, descriptor = map(int, sys.argv[1:4])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals_to_parent()
     settings = json.loads(sys.argv[4])
     robot = make_robot(settings["robot"], settings["arguments"])
+    leave_signals_to_parent()  # once more: the robot's driver may have seen to them
     Adapter(robot, news, calls, descriptor).run()
 
 

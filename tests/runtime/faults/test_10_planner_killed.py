@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import textwrap
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +26,22 @@ from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.process_planner import ProcessPlanner
 
 PERIOD = 0.02
+PROGRAM = textwrap.dedent(
+    """
+    import sys, time
+    sys.path[:0] = [{tests!r}, {faults!r}]
+    from shipped import open_shipped
+    from test_09_planner_hangs import ask
+    from hiernav.runtime.process_planner import ProcessPlanner
+    planner = ProcessPlanner(open_shipped("point"), 0.1, 6400)
+    ask(planner)
+    print(planner._child.process.pid, planner.status.pid, flush=True)
+    sys.stdin.readline()
+    ask(planner)
+    print(f"answered, restarts {{planner.restart_count()}}, failed {{planner.failed}}", flush=True)
+    time.sleep(60.0)
+    """
+)
 
 
 def test_a_killed_planner_is_replaced_and_answers_what_was_asked():
@@ -46,10 +66,25 @@ def test_a_keeper_that_is_killed_is_a_fault_and_takes_its_planner_along():
         assert "keeper ended" in planner.failed
     finally:
         planner.close()
-    end = time.monotonic() + 30.0
-    while _alive(child) and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not _alive(child)
+    wait_for_the_end_of(child)
+
+
+def test_signals_are_left_to_the_control_process_and_without_it_keeper_and_planner_end():
+    program = PROGRAM.format(tests=str(Path(__file__).parents[1]), faults=str(Path(__file__).parent))
+    control = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert control.stdin is not None and control.stdout is not None
+    processes = [int(pid) for pid in control.stdout.readline().split()]
+    for pid in processes:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            os.kill(pid, number)
+    control.stdin.write("go on\n")
+    control.stdin.flush()
+    assert control.stdout.readline() == "answered, restarts 0, failed None\n"
+    control.kill()
+    control.communicate()
+    wait_for_the_end_of(*processes)
 
 
 @pytest.mark.realtime
@@ -78,6 +113,13 @@ def test_the_loop_misses_no_extra_tick():
         planner.close()
     assert result.reached and len(set(killed)) == 2 and planner.restart_count() == 2
     assert driver.loop.overruns == 0
+
+
+def wait_for_the_end_of(*processes: int) -> None:
+    end = time.monotonic() + 30.0
+    while any(map(_alive, processes)) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not any(map(_alive, processes))
 
 
 def _alive(pid: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -79,3 +80,45 @@ def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert json.loads((out / "summary.json").read_text())["timing"]["ticks"] > 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_all_processes_ends_them_in_order_and_the_robot_is_braked_and_released(tmp_path, number):
+    log, adapter = tmp_path / "log", tmp_path / "adapter.py"
+    adapter.write_text(
+        f"import sys\nsys.path.insert(0, {str(Path(__file__).parents[1])!r})\nimport scripted_robot\n"
+        f"def make():\n    return scripted_robot.make({str(log)!r})\n"
+    )
+    command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
+    process = subprocess.Popen(
+        [*command, "--adapter", f"{adapter}:make", "--out", str(tmp_path / "out")],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "ready for goals" in process.stdout.readline()
+    family = descendants(process.pid)
+    for _ in range(300):  # the keeper of the planner, the planner and the adapter
+        if len(family) == 3 and log.exists() and log.read_text():
+            break
+        time.sleep(0.1)
+        family = descendants(process.pid)
+    assert len(family) == 3
+    for pid in (*family, process.pid):
+        os.kill(pid, number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0 and "Traceback" not in errors, errors
+    done = [line.split()[0] for line in log.read_text().splitlines()]
+    assert set(done[:-1]) == {"brake"} and done[-1] == "close"
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in family)
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes that it started, and those that these did."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+        except OSError:
+            continue
+    return [each for child in found for each in (child, *descendants(child))]

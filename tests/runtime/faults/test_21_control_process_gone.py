@@ -10,8 +10,10 @@ import textwrap
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.robot import CommandWatchdog
 
 ROBOT = Path(__file__).parents[1] / "scripted_robot.py"
@@ -75,6 +77,20 @@ def test_it_does_so_within_50_ms(tmp_path, number):
     done = watch(tmp_path, number)
     last = max(k for k, (what, _) in enumerate(done) if what == "send")
     assert done[last + 1][1] - done[last][1] <= 0.055  # and what the adapter takes to wake up
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path, number):
+    path = tmp_path / "robot.log"
+    robot = ProcessRobot(f"{ROBOT}:make", {"path": str(path)})
+    try:
+        robot.read()
+        os.kill(robot.child.process.pid, number)
+        robot.send(np.array([1.0, 0.0]))
+        _wait_for(lambda: "send" in path.read_text())
+    finally:
+        robot.close()
+    assert robot.child.ended == 0 and path.read_text().splitlines()[-1].startswith("close")
 
 
 def _wait_for(condition, patience: float = 30.0) -> None:
