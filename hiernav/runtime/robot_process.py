@@ -1,7 +1,8 @@
 """A robot's adapter in a process of its own, which brakes by itself when commands stop coming.
 
 Run as `python -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to the
-control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot.
+control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot. Where the robot's own
+code fails, this process brakes the robot before it ends.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import os
 import select
 import sys
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +34,7 @@ END = b"e"
 STATUS = 64
 """Bytes at the front of the memory: what the watchdog has done."""
 LAST_BRAKES = 1.0
-"""Time for which a robot is braked whose control process is gone, before it is released [s]."""
+"""Time for which a robot is braked whose control process is gone, or which has failed, before it is released [s]."""
 
 
 def main() -> None:
@@ -40,7 +43,7 @@ def main() -> None:
     settings = json.loads(sys.argv[4])
     robot = make_robot(settings["robot"], settings["arguments"])
     leave_signals_to_parent()  # once more: the robot's driver may have seen to them
-    Adapter(robot, news, calls, descriptor).run()
+    sys.exit(Adapter(robot, news, calls, descriptor).run())
 
 
 def make_robot(name: str, arguments: dict[str, Any]) -> Robot:
@@ -72,7 +75,8 @@ class Adapter:
 
     def __init__(self, robot: Robot, news: int, calls: int, descriptor: int) -> None:
         self.robot = robot
-        self.watchdog = CommandWatchdog(robot.control_period)
+        self._period = robot.control_period
+        self.watchdog = CommandWatchdog(self._period)
         self._news, self._calls = news, calls
         memory = self._memory = mapped(descriptor)
         self._status = np.frombuffer(memory, np.float64, 4)
@@ -82,32 +86,60 @@ class Adapter:
         self._shown: object = None
         self._braked = 0.0
 
-    def run(self) -> None:
-        """Until the control process says so, or is gone."""
-        news: bytes | None = b""
-        robot, idle = self.robot, 0.25 * self.robot.control_period
+    def run(self) -> int:
+        """Follow the control process until it says so, is gone, or something fails; then brake and release the robot.
+
+        Returns:
+            The exit status: 1 where something failed, which is told on stderr, else 0.
+        """
+        failures: list[BaseException] = []
+        last_brakes = LAST_BRAKES
+        try:
+            if self._follow():
+                last_brakes = 0.0
+        except BaseException as error:
+            failures.append(error)
+        failures += self._brake_for(last_brakes)
+        _tell(failures)  # not before: there may be nobody who reads it
+        try:
+            self.robot.close()
+        except BaseException as error:
+            failures.append(error)
+            _tell([error])
+        return 1 if failures else 0
+
+    def _follow(self) -> bool:
+        """Hand commands over and frames back. True once this process is not needed any more, False if it is alone."""
+        robot, idle = self.robot, 0.25 * self._period
         granted = request_realtime()
         facts = {"control_period": robot.control_period, "action_dim": robot.action_dim, "realtime": granted}
         self._answer(facts)
         self._publish()
         while True:
             ready = select.select([self._news, self._calls], [], [], idle)[0]
-            news = b""
             if self._calls in ready and not self._take_call():
-                news = None
-                break
-            if self._news in ready:
-                news = wait_for_news(self._news, 0.0)
-            if news is None or END in news:
-                break
+                return False
+            news = wait_for_news(self._news, 0.0) if self._news in ready else b""
+            if news is None:
+                return False
+            if END in news:
+                return True
             self._obey(time.monotonic())
             self._publish()
-        robot.brake()
-        end = time.monotonic() + (LAST_BRAKES if news is None else 0.0)
-        while time.monotonic() < end:
-            robot.brake()
-            time.sleep(robot.control_period)
-        robot.close()
+
+    def _brake_for(self, seconds: float) -> list[BaseException]:
+        """Brake once, then at the control rate for `seconds`, or `LAST_BRAKES` if a brake raises; what it raised."""
+        failures: list[BaseException] = []
+        began = time.monotonic()
+        while True:
+            try:
+                self.robot.brake()
+            except BaseException as error:
+                seconds = LAST_BRAKES
+                failures = failures or [error]
+            if time.monotonic() - began >= seconds:
+                return failures
+            time.sleep(self._period)
 
     def _obey(self, now: float) -> None:
         command = self._commands.get()
@@ -124,7 +156,7 @@ class Adapter:
                 self._status[0], self._status[1] = trips, now
                 self.robot.brake()
                 self._braked = now
-            elif trips and now - self._braked >= self.robot.control_period:
+            elif trips and now - self._braked >= self._period:
                 self.robot.brake()
                 self._braked = now
 
@@ -155,6 +187,12 @@ class Adapter:
 
     def _answer(self, answer: dict[str, Any]) -> None:
         os.write(self._calls, json.dumps(answer).encode() + b"\n")
+
+
+def _tell(failures: Sequence[BaseException]) -> None:
+    with suppress(OSError):
+        for failure in failures:
+            traceback.print_exception(failure)
 
 
 if __name__ == "__main__":

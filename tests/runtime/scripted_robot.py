@@ -1,8 +1,9 @@
-"""A robot for an adapter's process that writes down what is done to it, and when."""
+"""A robot for an adapter's process that writes down what is done to it, and when, and fails where it is told to."""
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 
@@ -12,15 +13,21 @@ PERIOD = 0.02
 
 
 class ScriptedRobot:
-    """Notes "send", "brake" and "close" with the monotonic time in a file, unbuffered."""
+    """Notes "send", "brake" and "close" with the monotonic time in a file, unbuffered.
+
+    What `fails` names works `good` times, then raises `failures` times.
+    """
 
     control_period = PERIOD
     action_dim = 2
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, fails: str = "", good: int = 0, failures: int = 1) -> None:
         self._file = open(path, "ab", buffering=0)
+        self._fails, self._good, self._failures = fails, good, failures
+        self._done = 0
 
     def read(self) -> SensorFrame:
+        self._try("read")
         still = np.zeros(3)
         return SensorFrame(time.monotonic(), still, still, np.array([0.0, -0.5, 0.0]), still, position_fix=np.zeros(2))
 
@@ -39,7 +46,13 @@ class ScriptedRobot:
 
     def _note(self, what: str) -> None:
         self._file.write(f"{what} {time.monotonic()}\n".encode())
+        self._try(what)
+
+    def _try(self, what: str) -> None:
+        self._done += what == self._fails
+        if what == self._fails and self._good < self._done <= self._good + self._failures:
+            raise OSError(f"{what}: bus error")
 
 
-def make(path: str) -> ScriptedRobot:
-    return ScriptedRobot(path)
+def make(path: str, **failure: Any) -> ScriptedRobot:
+    return ScriptedRobot(path, **failure)

@@ -47,6 +47,8 @@ MUTANTS = (
     Mutant("stop", WATCH, "if estimate is None or not math", "if False and not math", f"{T}/test_driver.py"),
     Mutant("adapter", f"{R}/robot.py", "if now - self._fed_at <= self.timeout:", "if True:",
            f"{F}/test_21_control_process_gone.py"),
+    Mutant("adapter that fails", f"{R}/robot_process.py", "failures += self._brake_for(last_brakes)", "pass",
+           f"{F}/test_21_control_process_gone.py"),
     Mutant("signals to all", f"{R}/child.py", "signal.signal(number, signal.SIG_IGN)", "pass",
            f"{F}/test_21_control_process_gone.py"),
     Mutant("action not finite", f"{R}/guard.py", "if not np.isfinite(action).all():", "if False:",

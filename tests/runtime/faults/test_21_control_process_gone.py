@@ -1,4 +1,4 @@
-"""The control process is killed or stopped: the adapter in its own process brakes the robot."""
+"""The control process is killed or stopped, or the robot's driver fails: the adapter in its own process brakes."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.robot import CommandWatchdog
+from hiernav.runtime.robot_process import LAST_BRAKES
 
 ROBOT = Path(__file__).parents[1] / "scripted_robot.py"
 CONTROL = textwrap.dedent(
@@ -79,6 +80,30 @@ def test_it_does_so_within_50_ms(tmp_path, number):
     assert done[last + 1][1] - done[last][1] <= 0.055  # and what the adapter takes to wake up
 
 
+@pytest.mark.parametrize(
+    "fails, good, failures", [("read", 40, 1), ("send", 5, 99999), ("brake", 0, 1), ("brake", 0, 9)]
+)
+def test_an_adapter_whose_robot_fails_brakes_for_a_second_and_then_releases_it(tmp_path, capfd, fails, good, failures):
+    path = tmp_path / "robot.log"
+    robot = ProcessRobot(f"{ROBOT}:make", {"path": str(path), "fails": fails, "good": good, "failures": failures})
+    try:
+        robot.send(np.array([1.0, 0.0]))
+        _wait_for(lambda: "send" in path.read_text())
+        while robot.child.ended is None:
+            robot.brake() if fails == "brake" else robot.send(np.array([1.0, 0.0]))
+            time.sleep(robot.control_period)
+        with pytest.raises(RuntimeError, match="adapter ended with status 1"):
+            for _ in range(3):
+                robot.read()
+    finally:
+        robot.close()
+    done = [line.split() for line in path.read_text().splitlines()]
+    last = max(k for k, (what, _) in enumerate(done) if what == "send")
+    assert {what for what, _ in done[last + 1 : -1]} == {"brake"} and done[-1][0] == "close"
+    assert float(done[-1][1]) - float(done[last + 1][1]) >= LAST_BRAKES
+    assert f"OSError: {fails}: bus error" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path, number):
     path = tmp_path / "robot.log"
@@ -91,6 +116,17 @@ def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path
     finally:
         robot.close()
     assert robot.child.ended == 0 and path.read_text().splitlines()[-1].startswith("close")
+
+
+@pytest.mark.parametrize("fails", ["brake", "close"])
+def test_a_robot_that_fails_when_it_is_released_is_braked_all_the_same(tmp_path, fails):
+    path = tmp_path / "robot.log"
+    robot = ProcessRobot(f"{ROBOT}:make", {"path": str(path), "fails": fails})
+    robot.read()
+    robot.close()
+    assert robot.child.ended == 1
+    done = [line.split()[0] for line in path.read_text().splitlines()]
+    assert done[-2:] == ["brake", "close"] and (done.count("brake") > 2) == (fails == "brake")
 
 
 def _wait_for(condition, patience: float = 30.0) -> None:
