@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -40,7 +41,7 @@ class ProcessRobot:
         Args:
             robot: what makes the robot over there: "package.module:function" or "file.py:function".
             arguments: of that function, as JSON can hold them.
-            patience: time the robot may take to start, and to answer a `call` [s].
+            patience: time the robot may take to start, to show its first frame, and to answer a `call` [s].
             environment: variables of that process besides those of this one.
 
         Raises:
@@ -54,6 +55,7 @@ class ProcessRobot:
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._calls, theirs = socket.socketpair()
         self._calls.settimeout(patience)
+        self._patience = patience
         settings = json.dumps({"robot": robot, "arguments": dict(arguments or {})})
         with theirs:
             self.child = Child(
@@ -90,19 +92,19 @@ class ProcessRobot:
         return float(self._status[1])
 
     def read(self) -> SensorFrame:
-        """The newest frame.
+        """The newest frame; the first one is waited for.
 
         Raises:
-            RuntimeError: the adapter has ended.
+            RuntimeError: the adapter has ended, or shows no first frame.
         """
         message = self._frames.get()
+        if message is None and self._newest is None:
+            message = self._wait_for_frame()
         if message is not None:
             self._message, self._newest = message, decode_frame(message)
         elif self.child.ended is not None:
             raise RuntimeError(f"the robot's adapter ended with status {self.child.ended}")
-        if self._newest is None:
-            self._wait_for_start()
-            return self.read()
+        assert self._newest is not None
         return self._newest[0]
 
     def rehearse(self) -> None:
@@ -155,6 +157,17 @@ class ProcessRobot:
         if self._facts is None:
             self._facts = self._receive()
         return self._facts
+
+    def _wait_for_frame(self) -> bytes:
+        self._wait_for_start()
+        end = time.monotonic() + self._patience
+        while (message := self._frames.get()) is None:
+            if self.child.ended is not None:
+                raise RuntimeError(f"the robot's adapter ended with status {self.child.ended}")
+            if time.monotonic() > end:
+                raise RuntimeError(f"the robot's adapter shows no frame for {self._patience:g} s")
+            time.sleep(0.001)
+        return message
 
     def _receive(self) -> dict[str, Any]:
         line = b""

@@ -113,8 +113,8 @@ class Adapter:
         robot, idle = self.robot, 0.25 * self._period
         granted = request_realtime()
         facts = {"control_period": robot.control_period, "action_dim": robot.action_dim, "realtime": granted}
-        self._answer(facts)
         self._publish()
+        self._answer(facts)
         while True:
             ready = select.select([self._news, self._calls], [], [], idle)[0]
             if self._calls in ready and not self._take_call():

@@ -15,19 +15,21 @@ PERIOD = 0.02
 class ScriptedRobot:
     """Notes "send", "brake" and "close" with the monotonic time in a file, unbuffered.
 
-    What `fails` names works `good` times, then raises `failures` times.
+    What `fails` names works `good` times, then raises `failures` times. The first reading takes `slow` seconds.
     """
 
     control_period = PERIOD
     action_dim = 2
 
-    def __init__(self, path: str, fails: str = "", good: int = 0, failures: int = 1) -> None:
+    def __init__(self, path: str, fails: str = "", good: int = 0, failures: int = 1, slow: float = 0.0) -> None:
         self._file = open(path, "ab", buffering=0)
         self._fails, self._good, self._failures = fails, good, failures
-        self._done = 0
+        self._done, self._slow = 0, slow
 
     def read(self) -> SensorFrame:
         self._try("read")
+        time.sleep(self._slow)
+        self._slow = 0.0
         still = np.zeros(3)
         return SensorFrame(time.monotonic(), still, still, np.array([0.0, -0.5, 0.0]), still, position_fix=np.zeros(2))
 
@@ -54,5 +56,5 @@ class ScriptedRobot:
             raise OSError(f"{what}: bus error")
 
 
-def make(path: str, **failure: Any) -> ScriptedRobot:
-    return ScriptedRobot(path, **failure)
+def make(path: str, **manners: Any) -> ScriptedRobot:
+    return ScriptedRobot(path, **manners)

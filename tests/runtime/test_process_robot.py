@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,30 @@ def test_commands_reach_the_robot_and_frames_come_back(tmp_path):
         robot.close()
     done = [line.split()[0] for line in log.read_text().splitlines()]
     assert done[0] == "send" and done[-2:] == ["brake", "close"]
+
+
+def test_a_robot_that_is_slow_at_first_is_waited_for(tmp_path):
+    robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log"), "slow": 0.3})
+    try:
+        assert robot.control_period == 0.02
+        assert robot.read().gyro is not None
+    finally:
+        robot.close()
+
+
+def test_an_adapter_without_a_first_frame_is_an_error_once_patience_ends(tmp_path):
+    robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log")})
+    try:
+        robot.read()
+        os.kill(robot.child.process.pid, signal.SIGSTOP)
+        robot._patience = 0.2
+        with pytest.raises(RuntimeError, match="adapter shows no frame for 0.2 s"):
+            for _ in range(3):
+                robot._newest = None
+                robot.read()
+    finally:
+        os.kill(robot.child.process.pid, signal.SIGCONT)
+        robot.close()
 
 
 def test_an_adapter_that_ends_is_an_error_at_the_next_read(tmp_path):
