@@ -67,7 +67,7 @@ class Estimator:
         )
         self._stamp = -math.inf
         self._step = 0.0
-        self._fix_stamp = -math.inf
+        self._fix_stamp = self._fix_shown = -math.inf
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
@@ -230,12 +230,16 @@ class Estimator:
             self._history.popleft()
 
     def _correct_position(self, frame: SensorFrame) -> None:
-        fix = _components(frame.position_fix, 2)
-        if fix is None:
-            if frame.position_fix is not None:
-                self.counts["fix_not_finite"] += 1
+        if frame.position_fix is None:
             return
         stamp = self._stamp if frame.fix_stamp is None else float(frame.fix_stamp)
+        if stamp == self._fix_shown:  # an adapter shows each fix until there is a newer one
+            return
+        self._fix_shown = stamp
+        fix = _components(frame.position_fix, 2)
+        if fix is None:
+            self.counts["fix_not_finite"] += 1
+            return
         if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
             self.counts["stale_fix"] += 1
             return

@@ -35,7 +35,8 @@ class SensorFrame:
     position_fix: np.ndarray | None = None
     """(2,) position of the body origin in the world frame [m]."""
     fix_stamp: float | None = None
-    """When the position was measured, on the same clock; `stamp` if None [s]."""
+    """When the position was measured, on the same clock; `stamp` if None [s]. A fix with the stamp of the last one is
+    that one, shown again."""
     rotation: np.ndarray | None = None
     """(4,) unit quaternion w, x, y, z: the angular velocity as the inertial unit integrates it by itself, at its own
     rate, from any start. Its change from frame to frame counts alone, so that it may drift. A body that shakes within a

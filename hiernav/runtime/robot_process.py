@@ -17,6 +17,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import numpy as np
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import Mailbox, mapped
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.robot import CommandWatchdog, Robot
+from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
 from hiernav.runtime.wire import CAPACITY, encode_frame
 
 BRAKE = b"brake"
@@ -84,6 +85,7 @@ class Adapter:
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._truth = getattr(robot, "truth", None)
         self._shown: object = None
+        self._fix: tuple[np.ndarray, float] | None = None
         self._braked = 0.0
 
     def run(self) -> int:
@@ -165,7 +167,17 @@ class Adapter:
         if frame is self._shown:
             return
         self._shown = frame
-        self._frames.put(encode_frame(frame, None if self._truth is None else self._truth()))
+        self._frames.put(encode_frame(self._with_newest_fix(frame), None if self._truth is None else self._truth()))
+
+    def _with_newest_fix(self, frame: SensorFrame) -> SensorFrame:
+        """The frame with the newest fix, which its stamp tells from a newer one: the loop sees but the newest frame."""
+        if frame.position_fix is not None:
+            stamp = frame.stamp if frame.fix_stamp is None else frame.fix_stamp
+            if self._fix is None or not stamp < self._fix[1] <= frame.stamp:
+                self._fix = frame.position_fix, stamp
+        if self._fix is None:
+            return frame
+        return replace(frame, position_fix=self._fix[0], fix_stamp=self._fix[1])
 
     def _take_call(self) -> bool:
         """Call one of the robot's own methods, such as `restart` of a simulated one; False if nobody asks any more."""
@@ -180,7 +192,7 @@ class Adapter:
             answer = {"result": getattr(self.robot, request["method"])(**request["arguments"])}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
-        self._shown = None
+        self._shown = self._fix = None
         self._publish()
         self._answer(answer)
         return True

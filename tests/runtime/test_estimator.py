@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_motion import FIX_SIGMA, estimator_for, follow, frames, recorded
 
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.estimator import Estimator, EstimatorConfig, Trust
 from hiernav.runtime.robot import SensorFrame
 
 ROBOTS = ("point", "car", "doggo")
@@ -84,8 +84,8 @@ def test_a_frame_from_the_past_is_dropped():
     assert estimator.counts["stale_frame"] == 1
 
 
-@pytest.mark.parametrize("fix_stamp", [0.3, 0.2, 99.0, math.nan])
-def test_a_fix_that_is_repeated_older_or_from_the_future_is_dropped(fix_stamp):
+@pytest.mark.parametrize("fix_stamp", [0.28, 0.2, 99.0, math.nan])
+def test_a_fix_that_is_older_or_from_the_future_is_dropped(fix_stamp):
     motion = recorded("point")
     estimator, reference = estimator_for(motion), estimator_for(motion)
     for frame in list(frames(motion))[:17]:
@@ -98,6 +98,28 @@ def test_a_fix_that_is_repeated_older_or_from_the_future_is_dropped(fix_stamp):
             assert after is not None and expected is not None
             np.testing.assert_array_equal(after.pose, expected.pose)
     assert estimator.counts["stale_fix"] == 1
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.08, 0.9])
+def test_a_fix_that_is_shown_until_the_next_one_counts_once(latency):
+    """Be it good, garbage, or older than the memory; and it is no sign of life of a sensor that says nothing more."""
+    motion = recorded("point")
+    once, again = estimator_for(motion), estimator_for(motion)
+    shown: dict[str, object] = {}
+    for frame in frames(motion, latency=latency):
+        if frame.stamp > 1.5:
+            frame = replace(frame, position_fix=None, fix_stamp=None)
+        elif 0.95 < frame.stamp < 1.05 and frame.position_fix is not None:
+            frame = replace(frame, position_fix=np.full(2, math.nan))
+        if frame.position_fix is not None:
+            shown = {"position_fix": frame.position_fix, "fix_stamp": frame.fix_stamp}
+        expected, estimate = once.update(frame), again.update(replace(frame, **shown))
+        assert expected is not None and estimate is not None
+        np.testing.assert_array_equal(estimate.pose, expected.pose)
+        np.testing.assert_array_equal(estimate.covariance, expected.covariance)
+        assert (estimate.trust, estimate.why) == (expected.trust, expected.why)
+    assert again.counts == once.counts and once.counts["fix_not_finite"] == 1
+    assert estimate.trust is Trust.HOLD and "position_fix" in estimate.why
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

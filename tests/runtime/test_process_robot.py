@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import os
 import signal
+import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shipped import ROOT
 
-from hiernav.runtime.process_robot import ProcessRobot
+from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
+from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.robot import SensorFrame, Truth
-from hiernav.runtime.robot_process import make_robot
-from hiernav.runtime.wire import decode_frame, encode_frame
+from hiernav.runtime.robot_process import STATUS, Adapter, make_robot
+from hiernav.runtime.wire import CAPACITY, decode_frame, encode_frame
 
+EXAMPLE = f"{ROOT / 'deploy' / 'example_robot.py'}:make"
 SCRIPTED = f"{Path(__file__).parent / 'scripted_robot.py'}:make"
 anything = st.floats(allow_nan=True, allow_infinity=True)
 
@@ -86,6 +92,69 @@ def test_an_adapter_without_a_first_frame_is_an_error_once_patience_ends(tmp_pat
         robot.close()
 
 
+def test_every_fix_of_the_example_robot_reaches_a_loop_that_sees_every_fourth_frame(monkeypatch):
+    robot = make_robot(EXAMPLE, {})
+    now = robot._board._at
+    monkeypatch.setattr(sys.modules["example_robot"], "time", SimpleNamespace(monotonic=lambda: now))
+    memory = shared_memory(STATUS + 2 * Mailbox.size(CAPACITY))
+    adapter = Adapter(robot, -1, -1, memory)
+    frames = Mailbox(mapped(memory), STATUS + Mailbox.size(CAPACITY), CAPACITY)
+    read, made, seen, silences = robot.read, [], [], []
+    estimator = Estimator(EstimatorConfig(tilts=False))
+
+    def noting() -> SensorFrame:
+        frame = read()
+        made.extend([] if frame.fix_stamp is None else [frame.fix_stamp])
+        return frame
+
+    monkeypatch.setattr(robot, "read", noting)
+    for _ in range(500):
+        for _ in range(4):
+            now += 0.25 * robot.control_period
+            adapter._publish()
+        frame, _ = decode_frame(frames.get())
+        estimator.update(frame)
+        seen.extend([] if frame.fix_stamp in seen else [frame.fix_stamp])
+        silences.append(estimator._watch.silence("position_fix", frame.stamp))
+    os.close(memory)
+    assert len(made) > 90 and seen == made
+    assert max(silences) < 0.13
+    assert estimator.counts["stale_fix"] == 1, "the first one is older than the first frame that is seen"
+
+
+def test_the_newest_fix_of_the_example_robot_is_in_every_frame():
+    robot, stamps = ProcessRobot(EXAMPLE), set()
+    try:
+        while len(stamps) < 4:
+            frame = robot.read()
+            assert frame.position_fix is not None and frame.fix_stamp is not None
+            stamps.add(frame.fix_stamp)
+            time.sleep(0.002)
+    finally:
+        robot.close()
+
+
+def test_a_fix_that_was_overtaken_does_not_hide_the_newer_one():
+    adapter = Adapter(make_robot(EXAMPLE, {}), -1, -1, shared_memory(STATUS + 2 * Mailbox.size(CAPACITY)))
+    for stamp, fix_stamp, shown in ((1.0, None, 1.0), (1.1, 0.9, 1.0), (1.2, 99.0, 99.0), (1.3, 1.25, 1.25),
+                                    (0.1, 0.05, 0.05)):  # fmt: skip
+        frame = adapter._with_newest_fix(SensorFrame(stamp, position_fix=np.zeros(2), fix_stamp=fix_stamp))
+        assert frame.fix_stamp == shown
+        assert adapter._with_newest_fix(SensorFrame(stamp + 0.01)).fix_stamp == shown
+
+
+def test_a_robot_that_starts_anew_has_no_fix_of_before():
+    robot = simulated(robot="point", world="pillar(2,2,0)", noise={"fix_latency": 0.3})
+    try:
+        while robot.read().position_fix is None:
+            robot.brake()
+            time.sleep(robot.control_period)
+        robot.call("restart", seed=1)
+        assert robot.read().position_fix is None
+    finally:
+        robot.close()
+
+
 def test_an_adapter_that_ends_is_an_error_at_the_next_read(tmp_path):
     robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log")})
     robot.read()
@@ -110,7 +179,7 @@ def test_a_robot_that_cannot_be_made_is_refused_at_once(tmp_path):
 
 
 def test_the_example_robot_drives_where_it_is_told():
-    robot = make_robot(str(ROOT / "deploy" / "example_robot.py") + ":make", {})
+    robot = make_robot(EXAMPLE, {})
     frame = robot.read()
     assert frame.position_fix is not None and np.linalg.norm(frame.position_fix) < 0.2
     assert robot.send(np.array([1.5, 0.0])).tolist() == [1.0, 0.0]
