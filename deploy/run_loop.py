@@ -288,7 +288,7 @@ class Episodes:
         return self._finish(episodes, drives)
 
     def serve(self) -> int:
-        """Ready for goals until interrupted."""
+        """Ready for goals until interrupted, or until the robot's adapter has ended, which is a fault."""
         drive = Drive()
         self._watch(drive)
         if self.page is not None and not (self.arguments.serve or self.arguments.adapter):
@@ -298,7 +298,8 @@ class Episodes:
             self.console.print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})", highlight=False)
             self.driver.serve()
         result = self.driver.last_result
-        return self._finish([] if result is None else [self._episode(self.layout, result, drive)], [drive])
+        code = self._finish([] if result is None else [self._episode(self.layout, result, drive)], [drive])
+        return code if self.driver.gone is None else FAULT
 
     def _watch(self, drive: Drive) -> None:
         self.driver.audience.observers = [drive, *filter(None, [self.recorder, self.page])]

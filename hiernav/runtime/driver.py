@@ -22,7 +22,7 @@ from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
 from hiernav.runtime.observe import Audience, Observer, TickRecord
 from hiernav.runtime.pilot import Decision, Pilot
 from hiernav.runtime.rehearsal import Rehearsal
-from hiernav.runtime.robot import Robot, SensorFrame, Truth
+from hiernav.runtime.robot import Robot, RobotGone, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
 from hiernav.runtime.timing import TickTimer
@@ -123,6 +123,8 @@ class Driver:
         self._rehearsal: Rehearsal | None = None
         self.interrupted = False
         """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
+        self.gone: str | None = None
+        """Why the last run ended without anybody's wish: the robot cannot be read any more (`RobotGone`)."""
         self.last_result: RunResult | None = None
         """Of the goal that ended last."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
@@ -150,7 +152,10 @@ class Driver:
         return self.last_result
 
     def serve(self) -> None:
-        """Stay ready for goals (`set_goal`), until `quit`, SIGINT or SIGTERM. Faults are waited out, not raised."""
+        """Stay ready for goals (`set_goal`), until `quit`, SIGINT or SIGTERM, or until the robot is `gone`.
+
+        Other faults are waited out, not raised.
+        """
         self._begin()
         self._serving = True
         self._loop()
@@ -208,6 +213,8 @@ class Driver:
             self.supervisor.change(Mode.INIT, "new run", now)
         self._requests.clear()
         self._trip, self._ended, self._paused = None, None, False
+        self.gone = None
+        self._told: tuple[str, str | None] = ("", None)
         self._estimate, self._restarts = None, 0
         self._last_frame: SensorFrame | None = None
         self._occupancy: OccupancyMap | None = None
@@ -266,24 +273,34 @@ class Driver:
         try:
             self._step(now)
         except Exception as error:
-            log.exception("control step failed")
-            self._fail(f"{type(error).__name__}: {error}", now)
+            self._take_failure(error, now)
             self.robot.brake()
-        return not self._serving and self._trip is None
+        return self.gone is not None or (not self._serving and self._trip is None)
+
+    def _take_failure(self, error: Exception, now: float) -> None:
+        """A fault, told of once as long as it is not acknowledged: a robot may fail alike at every tick."""
+        why = f"{type(error).__name__}: {error}"
+        kind = re.sub(r"[0-9]+", "", why)
+        if (kind, self.supervisor.fault) != self._told:
+            log.exception("control step failed")
+        self._fail(why, now)
+        self._told = kind, self.supervisor.fault
+        if isinstance(error, RobotGone):
+            self.gone = why
 
     def _step(self, now: float) -> None:
         timer, supervisor = self.timer, self.supervisor
         timer.begin()
-        frame = self._last_frame = self.robot.read()
-        truth = self._truth() if self._truth is not None and self.audience else None
-        timer.mark("read")
-        self._estimate = estimate = self.estimator.update(frame)
-        timer.mark("estimate")
-        for _ in range(len(self._requests)):
-            self._requests.popleft()(now)
-        if self._stop_wanted is not None:
-            self._estop(self._stop_wanted, now)
-            self._stop_wanted = None
+        try:
+            frame = self._last_frame = self.robot.read()
+            truth = self._truth() if self._truth is not None and self.audience else None
+            timer.mark("read")
+            self._estimate = estimate = self.estimator.update(frame)
+            timer.mark("estimate")
+        except Exception:
+            self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
+            raise
+        self._take_requests(now)
         trust, doubt = self._blind.check(estimate, now)
         late = self._overruns.check(self.loop.overruns_in_a_row)
         occupancy = decision = sent = None
@@ -311,6 +328,13 @@ class Driver:
         timer.end()
         if self.audience:
             self._show(now, frame, truth, estimate, occupancy, decision, sent, scale)
+
+    def _take_requests(self, now: float) -> None:
+        for _ in range(len(self._requests)):
+            self._requests.popleft()(now)
+        if self._stop_wanted is not None:
+            self._estop(self._stop_wanted, now)
+            self._stop_wanted = None
 
     def _get_ready(self, estimate: Estimate, occupancy: OccupancyMap, now: float) -> None:
         """INIT -> READY -> ARMED, as far as there is a goal that can be driven to."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
-from hiernav.runtime.robot import SensorFrame, Truth
+from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
 from hiernav.runtime.robot_process import BRAKE, END, STATUS
 from hiernav.runtime.wire import CAPACITY, decode_frame
 
@@ -95,15 +95,16 @@ class ProcessRobot:
         """The newest frame; the first one is waited for.
 
         Raises:
-            RuntimeError: the adapter has ended, or shows no first frame.
+            RobotGone: the adapter has ended.
+            RuntimeError: it shows no first frame.
         """
         message = self._frames.get()
         if message is None and self._newest is None:
             message = self._wait_for_frame()
         if message is not None:
             self._message, self._newest = message, decode_frame(message)
-        elif self.child.ended is not None:
-            raise RuntimeError(f"the robot's adapter ended with status {self.child.ended}")
+        else:
+            self._require_adapter()
         assert self._newest is not None
         return self._newest[0]
 
@@ -162,12 +163,15 @@ class ProcessRobot:
         self._wait_for_start()
         end = time.monotonic() + self._patience
         while (message := self._frames.get()) is None:
-            if self.child.ended is not None:
-                raise RuntimeError(f"the robot's adapter ended with status {self.child.ended}")
+            self._require_adapter()
             if time.monotonic() > end:
                 raise RuntimeError(f"the robot's adapter shows no frame for {self._patience:g} s")
             time.sleep(0.001)
         return message
+
+    def _require_adapter(self) -> None:
+        if self.child.ended is not None:
+            raise RobotGone(f"the robot's adapter ended with status {self.child.ended}")
 
     def _receive(self) -> dict[str, Any]:
         line = b""
@@ -177,6 +181,7 @@ class ProcessRobot:
             except TimeoutError:
                 raise RuntimeError(f"the robot's adapter does not answer for {self._calls.gettimeout()} s") from None
             if not part:
-                raise RuntimeError(f"the robot's adapter ended with status {self.child.process.wait(5.0)}")
+                self.child.process.wait(5.0)
+                self._require_adapter()
             line += part
         return json.loads(line)

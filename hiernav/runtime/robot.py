@@ -95,6 +95,10 @@ class Robot(Protocol):
         ...
 
 
+class RobotGone(RuntimeError):
+    """The robot cannot be read, nor will it ever be again: what drives it must be started anew."""
+
+
 class CommandWatchdog:
     """Tells an adapter that its last command is too old to be followed."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,15 @@ class ScriptedRobot:
         self._done += what == self._fails
         if what == self._fails and self._good < self._done <= self._good + self._failures:
             raise OSError(f"{what}: bus error")
+
+
+def write_adapter(log: Path, file: Path) -> Path:
+    """A file whose `make`, without arguments, makes a robot that writes to `log`."""
+    file.write_text(
+        f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nimport scripted_robot\n"
+        f"def make():\n    return scripted_robot.make({str(log)!r})\n"
+    )
+    return file
 
 
 def make(path: str, **manners: Any) -> ScriptedRobot:

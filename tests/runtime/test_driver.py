@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.observe import Observer, TickRecord
-from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.robot import RobotGone, SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import Episode, print_summary, summarise
 from hiernav.runtime.supervisor import InvalidTransition, Mode
@@ -236,6 +237,79 @@ def test_a_fallen_robot_is_a_fault():
     )
     result = driver.run(GOAL)
     assert result.reason == "fault" and "tilted" in result.fault
+
+
+def serve_failing(
+    does: dict[int, Callable[[Driver], object]],
+    until: float = math.inf,
+    message: Callable[[int], str] = lambda tick: "bus error",
+) -> list[Mode]:
+    """Serve a robot whose readings fail from the tenth on; what `does` says is done at readings; the mode at each."""
+    modes: list[Mode] = []
+
+    def see(frame: SensorFrame) -> SensorFrame:
+        modes.append(driver.supervisor.mode)
+        tick = len(modes)
+        does.get(tick, lambda driver: None)(driver)
+        if 10 <= tick < until:
+            raise OSError(message(tick))
+        return frame
+
+    driver = driver_of(Puck(sees=see, noise=1e-3))
+    driver.serve()
+    return modes
+
+
+def told(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [str(record.exc_info[1]) for record in caplog.records if record.message == "control step failed"]
+
+
+def test_a_robot_that_cannot_be_read_is_told_of_once_and_again_after_an_acknowledgement(caplog):
+    modes = serve_failing({500: Driver.acknowledge, 1000: Driver.quit}, message=lambda tick: f"no bus at {tick} ms")
+    assert set(modes[10:1000]) == {Mode.FAULT}
+    assert told(caplog) == ["no bus at 10 ms", "no bus at 500 ms"]
+
+
+def test_another_failure_is_told_of_as_well(caplog):
+    serve_failing({90: Driver.quit}, message=lambda tick: "bus error" if tick < 50 else "bus gone")
+    assert told(caplog) == ["bus error", "bus gone"]
+
+
+def test_a_robot_that_can_be_read_again_stays_in_fault_until_that_is_acknowledged(caplog):
+    modes = serve_failing({60: Driver.acknowledge, 70: Driver.quit}, until=20)
+    assert set(modes[10:60]) == {Mode.FAULT} and modes[69] is Mode.READY
+    assert told(caplog) == ["bus error"]
+
+
+def test_commands_get_through_where_the_robot_cannot_be_read():
+    waiting: list[int] = []
+    modes = serve_failing(
+        {
+            30: Driver.estop,
+            31: lambda driver: driver.set_goal(GOAL),
+            32: lambda driver: waiting.append(len(driver._requests)),
+            40: Driver.acknowledge,
+            50: Driver.quit,
+        }
+    )
+    assert set(modes[30:40]) == {Mode.ESTOP} and waiting == [0]
+    assert set(modes[40:50]) == {Mode.FAULT}, "acknowledged, but the cause is not gone"
+
+
+def test_a_robot_that_is_gone_ends_the_service():
+    class Gone(Puck):
+        def read(self) -> SensorFrame:
+            if len(self.log) > 90:
+                driver.quit()
+            if len(self.log) > 30:
+                raise RobotGone("the robot's adapter ended with status 1")
+            return super().read()
+
+    robot = Gone(noise=1e-3)
+    driver = driver_of(robot)
+    driver.serve()
+    assert driver.gone == driver.supervisor.fault == "RobotGone: the robot's adapter ended with status 1"
+    assert len(robot.log) < 50 and robot.log[-1] == "brake"
 
 
 def test_each_run_starts_the_agent_afresh():

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from scripted_robot import write_adapter
 from shipped import RUN_LOOP
 
 PROGRAM = textwrap.dedent(
@@ -84,11 +85,7 @@ def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_all_processes_ends_them_in_order_and_the_robot_is_braked_and_released(tmp_path, number):
-    log, adapter = tmp_path / "log", tmp_path / "adapter.py"
-    adapter.write_text(
-        f"import sys\nsys.path.insert(0, {str(Path(__file__).parents[1])!r})\nimport scripted_robot\n"
-        f"def make():\n    return scripted_robot.make({str(log)!r})\n"
-    )
+    log, adapter = tmp_path / "log", write_adapter(tmp_path / "log", tmp_path / "adapter.py")
     command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
     process = subprocess.Popen(
         [*command, "--adapter", f"{adapter}:make", "--out", str(tmp_path / "out")],

@@ -12,6 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scripted_robot import write_adapter
+from shipped import RUN_LOOP
+from test_20_signals import descendants
 
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.robot import CommandWatchdog
@@ -116,6 +119,27 @@ def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path
     finally:
         robot.close()
     assert robot.child.ended == 0 and path.read_text().splitlines()[-1].startswith("close")
+
+
+def test_a_service_whose_adapter_dies_ends_with_code_1_so_that_it_is_started_again(tmp_path):
+    log, out = tmp_path / "log", tmp_path / "out"
+    adapter = write_adapter(log, tmp_path / "adapter.py")
+    command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
+    service = subprocess.Popen(
+        [*command, "--planner", "sync", "--adapter", f"{adapter}:make", "--out", str(out)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        _wait_for(lambda: log.exists() and log.read_text())
+        (child,) = descendants(service.pid)
+        os.kill(child, signal.SIGKILL)
+        _, errors = service.communicate(timeout=60)
+    finally:
+        service.kill()
+    assert service.returncode == 1
+    assert "RobotGone: the robot's adapter ended with status -9" in errors
+    assert errors.count("Traceback") <= 2, "of the tick, and of the stop that could not be verified"
+    assert (out / "summary.json").exists()
 
 
 @pytest.mark.parametrize("fails", ["brake", "close"])
