@@ -26,6 +26,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -38,6 +39,7 @@ from rich.console import Console
 
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
+from hiernav.nav.occupancy import RESOLUTION
 from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
 from hiernav.runtime.control import ControlServer, default_socket, parse_point, tell
 from hiernav.runtime.driver import Driver
@@ -48,7 +50,7 @@ from hiernav.runtime.guard import Guard
 from hiernav.runtime.noise import EXACT
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
-from hiernav.runtime.policy import make_agent
+from hiernav.runtime.policy import make_agent, require_fit
 from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import request_realtime
@@ -66,15 +68,21 @@ if TYPE_CHECKING:
 
 BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
+PICTURED = 20_000
+"""Ticks of a drive that its picture shows at most."""
+
+
+class GoalError(ValueError):
+    """A goal that cannot be driven to."""
 
 
 class Drive(Observer):
-    """What one drive looked like, collected tick by tick for its picture."""
+    """What one drive looked like, collected tick by tick for its picture: its end, where it is a long one."""
 
     def __init__(self) -> None:
-        self.path: list[np.ndarray] = []
-        self.plans: list[np.ndarray] = []
-        self.collisions: list[np.ndarray] = []
+        self.path: deque[np.ndarray] = deque(maxlen=PICTURED)
+        self.plans: deque[np.ndarray] = deque(maxlen=PICTURED)
+        self.collisions: deque[np.ndarray] = deque(maxlen=PICTURED)
         self.armed_age: float | None = None
 
     def event(self, event: Event) -> None:
@@ -95,7 +103,7 @@ class Drive(Observer):
 
         collisions = np.array(self.collisions).reshape(-1, 2)
         path = np.array(self.path).reshape(-1, 2)
-        draw_layout(layout, file, {"path": path, "plans": self.plans, "collisions": collisions, "title": title})
+        draw_layout(layout, file, {"path": path, "plans": list(self.plans), "collisions": collisions, "title": title})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -114,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_BUNDLE
     except (ValueError, OSError, RuntimeError) as error:
         print(f"run_loop: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_INPUT
+        return BAD_GOAL if isinstance(error, GoalError) else BAD_INPUT
 
 
 def _join_goal(argv: Sequence[str]) -> list[str]:
@@ -175,7 +183,7 @@ def _dry_run(arguments: argparse.Namespace) -> int:
     print_report(found)
     if found["bundle"].get("error"):
         return BAD_BUNDLE
-    return FAULT if found["robot"].get("error") else OK
+    return FAULT if any("error" in part for part in found.values()) else OK
 
 
 def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
@@ -184,7 +192,11 @@ def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
     path = arguments.settings or (own if own.exists() else None)
     asked = {
         "estimator": {"tilts": spec.free_base},
-        "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS},
+        "driver": {
+            "robot_radius": spec.radius,
+            "goal_radius": GOAL_RADIUS,
+            "max_steps": parse_world(arguments.world).max_steps,
+        },
     }
     settings = load_settings(path, arguments.set, asked)
     return replace(settings, noise=EXACT) if arguments.exact else settings
@@ -216,10 +228,11 @@ def _run(arguments: argparse.Namespace) -> int:
     with ExitStack() as stack:
         # both start while the rest is made ready
         remote = None if arguments.fast else _process_robot(arguments, spec, settings, stack)
-        layouts = [_layout(world, arguments.seed + k, spec, goal) for k in range(arguments.episodes)]
+        start_known = not arguments.adapter
+        layouts = [_layout(world, arguments.seed + k, spec, goal, start_known) for k in range(arguments.episodes)]
         link = None
         if not arguments.fast and arguments.planner != "sync":
-            link = ProcessPlanner(bundle, spec.radius, layouts[0].occupancy(0.0).occupied.size)
+            link = ProcessPlanner(bundle, settings.driver.robot_radius, layouts[0].occupancy(0.0).occupied.size)
             stack.callback(link.close)
         episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
         return episodes.serve() if arguments.serve or view else episodes.drive()
@@ -251,16 +264,19 @@ class Episodes:
             simulated = SimRobot(spec, self.layout, settings.noise, self.layout.seed)
             clock, robot = FakeClock(), simulated
             self._reset = lambda layout: simulated.reset(layout, layout.seed)
+        require_fit(bundle, robot)
         rehearsal = None if arguments.view is None else FaultyRobot(robot, arguments.seed)
-        guard = replace(settings.guard, slew_limit=bundle.manifest.guard.slew_limit)
+        limits = [limit for limit in (settings.guard.slew_limit, bundle.manifest.guard.slew_limit) if limit is not None]
+        guard = replace(settings.guard, slew_limit=min(limits, default=None))
+        driver = settings.driver
         self.driver = Driver(
             rehearsal or robot,
-            Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS, link), link),
+            Pilot(make_agent(bundle, driver.robot_radius, driver.goal_radius, link), link),
             lambda stamp: self.layout.occupancy(stamp),
             clock,
             Estimator(settings.estimator),
             Guard(spec.action_dim, guard),
-            replace(settings.driver, max_steps=self.layout.spec.max_steps),
+            driver,
             rehearsal=0.0 if arguments.fast else settings.realtime.rehearsal,
         )
         self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
@@ -346,6 +362,7 @@ def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
     bundle = load_bundle(path)
     bundle.require_robot(spec.name, file_sha256(spec.xml_path))
     bundle.require_layout(observation_layout(spec.name, clock="clock" in bundle.layout.names))
+    bundle.require_resolution(RESOLUTION)
     return bundle
 
 
@@ -357,7 +374,7 @@ def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle
 
     about = About(
         robot=spec.name,
-        robot_radius=spec.radius,
+        robot_radius=driver.config.robot_radius,
         goal_radius=driver.config.goal_radius,
         control_period=spec.control_period,
         bundle=str((arguments.bundle or BUNDLES / spec.name).resolve()),
@@ -376,13 +393,17 @@ def _open_page(arguments: argparse.Namespace, driver: Driver, rehearsal: FaultyR
     # nobody rehearses faults with a robot that can hurt someone
     faults = {} if arguments.adapter else {name: partial(rehearsal.inject, name) for name in FAULTS}
     title = f"hiernav: {spec.name} in {arguments.world}"
-    page = ViewerLink(driver, spec.radius, driver.config.goal_radius, title, arguments.view, faults)
+    page = ViewerLink(driver, driver.config.robot_radius, driver.config.goal_radius, title, arguments.view, faults)
     print(f"live page: {page.url}", flush=True)
     return page
 
 
-def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | None) -> Layout:
-    """The world of an episode, with the user's goal if there is one."""
+def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | None, start_known: bool) -> Layout:
+    """The world of an episode, with the user's goal if there is one.
+
+    Raises:
+        GoalError: that cannot be driven to; from where a real robot stands is for the driver to find out.
+    """
     layout = sample_layout(world, seed, spec.radius)
     if goal is None:
         return layout
@@ -391,17 +412,17 @@ def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | Non
     occupancy = layout.occupancy(0.0)
     if not layout.in_field(goal[None])[0]:
         xmin, xmax, ymin, ymax = layout.extent
-        raise ValueError(
+        raise GoalError(
             f"--goal {goal[0]:g},{goal[1]:g} lies outside the field: x from {xmin:g} to {xmax:g}, "
             f"y from {ymin:g} to {ymax:g} m"
         )
     if not occupancy.is_free(goal, spec.radius):
-        raise ValueError(
+        raise GoalError(
             f"--goal {goal[0]:g},{goal[1]:g} is less than {spec.radius:g} m from an obstacle in seed {seed}: "
             "choose a free place (hiernav world --png draws the world)"
         )
-    if not is_solvable(occupancy, layout.start[:2], goal, spec.radius):
-        raise ValueError(f"--goal {goal[0]:g},{goal[1]:g} cannot be reached from the start in seed {seed}")
+    if start_known and not is_solvable(occupancy, layout.start[:2], goal, spec.radius):
+        raise GoalError(f"--goal {goal[0]:g},{goal[1]:g} cannot be reached from the start in seed {seed}")
     return replace(layout, goal=goal)
 
 

@@ -145,13 +145,13 @@ def test_a_malformed_goal_is_refused(refused, able_bundle, goal):
 
 
 def test_a_goal_outside_the_field_is_refused_with_its_extent(refused, able_bundle):
-    line = refused(2, "--bundle", able_bundle, "--world", "pillar(2,1.5,2)", "--goal", "-2.5,0")
+    line = refused(4, "--bundle", able_bundle, "--world", "pillar(2,1.5,2)", "--goal", "-2.5,0")
     assert "--goal -2.5,0 lies outside the field: x from -2 to 2, y from -1.5 to 1.5 m" in line
 
 
 def test_a_goal_inside_an_obstacle_is_refused_with_where_to_look(refused, able_bundle):
     x, y = sample_layout(parse_world("pillar(2,2,10)"), 4).pillars[0]
-    line = refused(2, "--bundle", able_bundle, "--seed", 4, "--goal", f"{x:.3f},{y:.3f}")
+    line = refused(4, "--bundle", able_bundle, "--seed", 4, "--goal", f"{x:.3f},{y:.3f}")
     assert (
         "is less than 0.1 m from an obstacle in seed 4: choose a free place (hiernav world --png draws the world)"
         in line
@@ -195,6 +195,56 @@ def test_a_bundle_that_does_not_fit_is_refused(refused, able_bundle, doggo_bundl
     manifest["observation"][0]["unit"] = "g"
     (bundle / "manifest.json").write_text(json.dumps(manifest))
     assert "observation[0] 'accelerometer': unit is 'g' in the bundle" in refused(3, "--bundle", bundle)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("control_period_s", 0.05, "control_period_s: 0.05 s in the bundle, 0.02 s on this robot"),
+        ("map_resolution_m", 0.1, "map_resolution_m: 0.1 m in the bundle, 0.05 m in the runtime"),
+    ],
+)
+def test_a_bundle_of_another_rate_or_resolution_is_refused(refused, able_bundle, tmp_path, field, value, says):
+    bundle = Path(shutil.copytree(able_bundle, tmp_path / "bundle"))
+    manifest = json.loads((bundle / "manifest.json").read_text())
+    (bundle / "manifest.json").write_text(json.dumps(manifest | {field: value}))
+    assert says in refused(3, "--bundle", bundle)
+
+
+def test_an_adapter_of_another_rate_is_refused_before_it_is_driven(script, able_bundle, tmp_path, capsys):
+    adapter = tmp_path / "slow.py"
+    tests = str(Path(__file__).parent / "runtime")
+    adapter.write_text(f"import sys\nsys.path.insert(0, {tests!r})\nfrom puck import Puck\nmake = Puck\n")
+    arguments = ["--bundle", str(able_bundle), "--adapter", f"{adapter}:make", "--out", str(tmp_path / "out")]
+    assert script.main(arguments) == 3
+    assert "control_period_s: 0.02 s in the bundle, 0.1 s on this robot" in capsys.readouterr().err
+    assert script.main([*arguments, "--dry-run"]) == 1
+    assert "0.1 s on this robot" in " ".join(capsys.readouterr().out.split())
+
+
+def test_settings_that_are_accepted_are_obeyed(script, able_bundle, tmp_path):
+    made: list[object] = []
+
+    class Watched(script.Episodes):
+        def drive(self) -> int:
+            made.append(self.driver)
+            return super().drive()
+
+    script.Episodes, before = Watched, script.Episodes
+    try:
+        asked = {"driver.goal_radius": 0.2, "driver.max_steps": 7, "driver.robot_radius": 0.12, "guard.slew_limit": 0.3}
+        settings = [text for key, value in asked.items() for text in ("--set", f"{key}={value}")]
+        out = tmp_path / "out"
+        arguments = ["--fast", "--bundle", str(able_bundle), "--no-pictures", "--out", str(out), *settings]
+        script.main(arguments)
+    finally:
+        script.Episodes = before
+    driver = made[0]
+    option = driver.pilot.agent.option
+    assert (driver.config.goal_radius, option.goal_radius) == (0.2, 0.2)
+    assert (driver.config.robot_radius, option.sweep_radius) == (0.12, 0.12)
+    assert driver.guard.config.slew_limit == 0.3
+    assert json.loads((out / "summary.json").read_text())["episodes"][0]["steps"] == 7
 
 
 def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):

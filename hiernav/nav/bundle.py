@@ -161,6 +161,24 @@ class Bundle:
                 f"({self.manifest.robot_sha256[:12]} in the bundle, {sha256[:12]} here)"
             )
 
+    def require_period(self, period: float) -> None:
+        """Raise BundleError unless the robot is driven at the rate that the skill was trained at; `period` in [s]."""
+        theirs = self.manifest.control_period_s
+        if not abs(period - theirs) <= 1e-6:
+            raise BundleError(f"control_period_s: {theirs:g} s in the bundle, {period:g} s on this robot")
+
+    def require_actions(self, count: int) -> None:
+        """Raise BundleError unless the robot has as many actuators as the skill commands."""
+        theirs = self.golden["action"].shape[1]
+        if count != theirs:
+            raise BundleError(f"actions: {theirs} in the bundle, {count} on this robot")
+
+    def require_resolution(self, resolution: float) -> None:
+        """Raise BundleError unless maps are of the resolution that the planner was trained with; in [m]."""
+        theirs = self.manifest.map_resolution_m
+        if not abs(resolution - theirs) <= 1e-9:
+            raise BundleError(f"map_resolution_m: {theirs:g} m in the bundle, {resolution:g} m in the runtime")
+
     def require_layout(self, layout: ObservationLayout) -> None:
         """Raise BundleError naming the first field in which the robot's observation differs from the bundle's."""
         ours, theirs = layout.terms, self.layout.terms

@@ -16,7 +16,7 @@ from rich.table import Table
 from hiernav.nav.bundle import Bundle
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
-from hiernav.runtime.policy import check_golden, load_policies
+from hiernav.runtime.policy import check_golden, load_policies, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import READINGS
@@ -31,8 +31,14 @@ def report(
     open_bundle: Callable[[], Bundle], make_robot: Callable[[], ProcessRobot], settings: Settings
 ) -> dict[str, Any]:
     """Findings on bundle, robot, estimator and host, in JSON's own types; what failed has an "error"."""
-    found: dict[str, Any] = {"bundle": _attempt(lambda: _check_bundle(open_bundle()))}
-    found["robot"] = _attempt(lambda: _check_robot(make_robot()))
+    bundle: list[Bundle] = []
+
+    def check_bundle() -> dict[str, Any]:
+        bundle.append(open_bundle())
+        return _check_bundle(bundle[0])
+
+    found: dict[str, Any] = {"bundle": _attempt(check_bundle)}
+    found["robot"] = _attempt(lambda: _check_robot(make_robot(), bundle[0] if bundle else None))
     found["estimator"] = _attempt(_check_filter)
     found["host"] = _check_host(settings)
     return found
@@ -68,7 +74,9 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _check_robot(robot: ProcessRobot) -> dict[str, Any]:
+def _check_robot(robot: ProcessRobot, bundle: Bundle | None) -> dict[str, Any]:
+    if bundle is not None:
+        require_fit(bundle, robot)
     frame = robot.read()
     present = [name for name in READINGS if getattr(frame, name) is not None]
     absent = [name for name in READINGS if name not in present]

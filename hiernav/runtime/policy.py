@@ -11,6 +11,7 @@ import onnxruntime as ort
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, TensorSpec
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
+from hiernav.runtime.robot import Robot
 
 GOLDEN_TOLERANCE = 1e-5
 _DTYPES: dict[str, np.dtype[Any]] = {"tensor(float)": np.dtype(np.float32), "tensor(uint8)": np.dtype(np.uint8)}
@@ -115,6 +116,12 @@ def load_policies(bundle: Bundle) -> Policies:
             raise BundleError(f"{what}: {ours} in the network, {theirs} in the manifest")
     check_golden(bundle, policies)
     return policies
+
+
+def require_fit(bundle: Bundle, robot: Robot) -> None:
+    """Raise BundleError unless the bundle is for a robot of this rate, with as many actuators."""
+    bundle.require_period(robot.control_period)
+    bundle.require_actions(robot.action_dim)
 
 
 def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float) -> Planner:
