@@ -113,6 +113,8 @@ class Estimator:
     def _read(self, name: str, value: np.ndarray | None) -> Vector | None:
         """A sensor's reading, unless it is missing, garbage, or frozen for too long to be believed."""
         reading = _vector(value)
+        if reading is None and value is not None:
+            self._watch.expect(name, self._stamp)
         self._watch.see(name, reading, self._stamp)
         if reading is not None and self._watch.silence(name, self._stamp) >= self.config.hold_after:
             self.counts[f"{name}_frozen"] += 1

@@ -20,6 +20,7 @@ REPEATS = 3
 class _Sensor:
     sigma: float
     value: Reading
+    """The last one; nothing if it never gave any."""
     seen: float
     new: float
     changes: int = 0
@@ -48,12 +49,17 @@ class SensorWatch:
         self._sigma = dict(sigma)
         self._sensors: dict[str, _Sensor] = {}
 
+    def expect(self, name: str, stamp: float) -> None:
+        """The robot has this sensor, whatever it says: it counts as silent from `stamp` [s] on until it is heard of."""
+        if name not in self._sensors:
+            self._sensors[name] = _Sensor(self._sigma[name], (), stamp, stamp)
+
     def see(self, name: str, value: Reading | None, stamp: float) -> None:
         """Take note of a reading, None where there was none, at `stamp` [s]."""
         if value is None:
             return
         sensor = self._sensors.get(name)
-        if sensor is None:
+        if sensor is None or not sensor.value:
             new = _Sensor(self._sigma[name], value, stamp, stamp, stir_from=value, leap_from=value)
             self._sensors[name] = new
             return
@@ -72,7 +78,7 @@ class SensorWatch:
             sensor.leap_from, sensor.leapt = value, stamp
 
     def silence(self, name: str, stamp: float) -> float:
-        """For how long a sensor has said nothing new [s]; 0 for one that has never been heard of."""
+        """For how long a sensor has said nothing new [s]; 0 for one that the robot may not have."""
         sensor = self._sensors.get(name)
         if sensor is None:
             return 0.0

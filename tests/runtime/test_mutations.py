@@ -86,6 +86,8 @@ MUTANTS = (
            f"{F}/test_16_other_robot.py"),
     Mutant("value not finite", f"{R}/estimator.py", "if not -ABSURD < component < ABSURD:", "if False:",
            f"{F}/test_03_not_finite.py"),
+    Mutant("no value but garbage", f"{R}/estimator.py", "if reading is None and value is not None:", "if False:",
+           f"{F}/test_03_not_finite.py"),
     Mutant("carried away", f"{R}/estimator.py", "if self._rejected[sensor] < patience or not agrees:", "if True:",
            f"{F}/test_05_kidnapped.py"),
     Mutant("latency of a fix", f"{R}/estimator.py", "then = self._position_at(stamp)",

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from puck import GOAL, Puck, driver_of
 from runtime_motion import FIX_SIGMA, estimator_for, follow, frames, recorded
 
 from hiernav.runtime.estimator import Trust
@@ -35,12 +36,36 @@ def test_a_channel_that_is_not_finite_is_rejected_and_the_state_stays_finite(rob
     assert errors.position_rms < worst
 
 
-def test_a_sensor_that_only_gives_nan_is_lost():
+@pytest.mark.parametrize("begin", [0.0, 1.0])
+@pytest.mark.parametrize("sensor", ["accelerometer", "gyro", "velocimeter"])
+def test_a_sensor_that_only_gives_nan_is_held_for_and_lost_from_the_start_on_as_well(sensor, begin):
+    motion = recorded("point")
+    garbage = {sensor: np.full(3, math.nan)}
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        return frame if frame.stamp < begin else replace(frame, **garbage)
+
+    errors = follow(motion, estimator_for(motion), frames(motion), damage)
+    trust = {estimate.stamp: estimate.trust for estimate in errors.estimates}
+    assert all(value is Trust.GOOD for stamp, value in trust.items() if stamp < begin + 0.2)
+    assert all(value is Trust.HOLD for stamp, value in trust.items() if begin + 0.3 < stamp < begin + 0.75)
+    assert all(value is Trust.LOST for stamp, value in trust.items() if stamp > begin + 0.85)
+    assert errors.estimates[-1].why.startswith(sensor)
+
+
+def test_a_sensor_that_gives_nan_at_first_is_trusted_once_it_measures():
     motion = recorded("point")
 
     def damage(frame: SensorFrame) -> SensorFrame:
-        return frame if frame.stamp < 1.0 else replace(frame, gyro=np.full(3, math.nan))
+        return frame if frame.stamp >= 0.5 else replace(frame, gyro=np.full(3, math.nan))
 
     errors = follow(motion, estimator_for(motion), frames(motion), damage)
-    assert errors.estimates[-1].trust is Trust.LOST
-    assert errors.estimates[-1].why.startswith("gyro")
+    assert any(estimate.trust is Trust.HOLD for estimate in errors.estimates)
+    assert all(estimate.trust is Trust.GOOD for estimate in errors.estimates if estimate.stamp >= 0.5)
+
+
+def test_a_robot_whose_gyro_never_measures_does_not_drive_on():
+    robot = Puck(control_period=0.02, noise=1e-3, sees=lambda frame: replace(frame, gyro=np.full(3, math.nan)))
+    result = driver_of(robot).run(GOAL)
+    assert result.reason == "fault" and result.fault.startswith("gyro says nothing new for 0.8")
+    assert robot.log[-1] == "brake"
