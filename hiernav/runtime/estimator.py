@@ -43,8 +43,6 @@ class Estimator:
         self.config = config = config or EstimatorConfig()
         self.counts: Counter[str] = Counter()
         """How often something was dropped, rejected or started again, by name."""
-        self.last_accepted: dict[str, float] = {}
-        """Stamp of the last measurement accepted from each sensor [s]."""
         self._field = math.hypot(*config.magnetic_field)
         self._field_heading = math.atan2(config.magnetic_field[1], config.magnetic_field[0])
         # Chi-square quantiles: of one normal variable's square, and of two such, which is an exponential distribution.
@@ -284,7 +282,6 @@ class Estimator:
 
     def _accept(self, sensor: str) -> None:
         self._rejected[sensor] = 0
-        self.last_accepted[sensor] = self._stamp
 
     def _reject(self, sensor: str, miss: tuple[float, ...], spread: float | None = None) -> bool:
         """Count a rejected measurement.

@@ -12,20 +12,14 @@ class TermHold:
 
     def __init__(self) -> None:
         self._last: dict[str, np.ndarray] = {}
-        self.held = 0
-        """How often a value was held."""
 
     def fill(self, frame: SensorFrame) -> dict[str, np.ndarray]:
         """Terms by name, (1, d) each. A sensor that never gave a good value reads zero, one never seen is absent."""
-        present, last = frame.terms(), self._last
-        for name, value in present.items():
+        last = self._last
+        for name, value in frame.terms().items():
             value = np.asarray(value, dtype=np.float64).reshape(1, -1)
             # the square of the length is finite only if every component is: one short call instead of three
             if not np.vdot(value, value) < np.inf:
-                good = np.isfinite(value)
-                self.held += not good.all()
-                value = np.where(good, value, last.get(name, np.zeros_like(value)))
+                value = np.where(np.isfinite(value), value, last.get(name, np.zeros_like(value)))
             last[name] = value
-        if len(last) > len(present):
-            self.held += len(last) - len(present)
         return dict(last)
