@@ -52,7 +52,8 @@ class EstimatorConfig:
     reinit_spread: float = 0.3
     """The last two rejected measurements must agree to this to be believed [m, m/s, rad; rad/s: `max_jump`]."""
     max_gap: float = 1.0
-    """Without a frame for this long, nothing of the state is worth keeping [s]."""
+    """Without a frame for this long, nothing of the state is worth keeping; a lone stamp this far ahead is not believed
+    [s]."""
     history: float = 0.5
     """Oldest fix that can still be used [s]."""
     max_jump: float = 6.0
@@ -105,8 +106,8 @@ class Estimate:
     why: str = ""
     """What the estimate suffers from, where it is not good."""
     restarts: int = 0
-    """How often position or heading were far off (`reinit_spread`) and started again, as after being carried away.
-    Plans made before are void."""
+    """How often position or heading were far off (`reinit_spread`) and started again, as after being carried away, or
+    everything did. It never goes down. Plans made before are void."""
 
     def body_velocity(self) -> tuple[float, float]:
         """Forward and left, heading frame [m/s]."""

@@ -21,6 +21,8 @@ ABSURD = 1e6
 """No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
+JUMP_AFTER, RESTART_AFTER = 2, 10
+"""Frames in a row that must agree on another time before it is believed: a later one, and an earlier one."""
 
 
 class _Accuracy(NamedTuple):
@@ -50,11 +52,13 @@ class Estimator:
         self._gate_2 = -2.0 * math.log(1.0 - config.gate_probability)
         self._limits = [(name, config.hold_after, config.lost_after) for name in VECTOR_SENSORS]
         self._limits.append(("position_fix", config.fix_hold_after, config.fix_lost_after))
+        self._starts = 0
         self.reset()
 
     def reset(self) -> None:
-        """Forget the state, as after being carried away. Counts are kept."""
+        """Forget the state, as after being carried away. Counts are kept, and `Estimate.restarts` goes up."""
         config = self.config
+        self._starts += 1
         # A body that shivers at rest, sampled in step with it, would otherwise pass for a gyro of any bias.
         self._filter = PlanarFilter(config.velocity_walk, config.bias_walk, 3.0 * config.bias_sigma)
         self._filter.replace(VELOCITY, (0.0, 0.0), 1.0)
@@ -63,7 +67,8 @@ class Estimator:
             dip_sine=config.magnetic_field[2] / self._field,
             magnetometer_sigma=max(1.5 * config.magnetometer_sigma / self._field, 0.01),
         )
-        self._stamp = -math.inf
+        self._stamp = self._odd_stamp = -math.inf
+        self._odd = 0
         self._step = 0.0
         self._fix_stamp = self._fix_shown = -math.inf
         self._rate: Vector = (0.0, 0.0, 0.0)
@@ -73,7 +78,6 @@ class Estimator:
         self._rejected: Counter[str] = Counter()
         self._last_miss: dict[str, tuple[float, ...]] = {}
         self._history: deque[list[float]] = deque()
-        self._restarts = 0
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
@@ -90,8 +94,9 @@ class Estimator:
     def update(self, frame: SensorFrame) -> Estimate | None:
         """Take in one frame.
 
-        A frame whose stamp is not after the last one is dropped as a whole, a fix whose stamp is not after the last
-        fix alone. Values that are not finite or absurdly large count as missing.
+        A frame whose stamp is not after the last one, or far after it, is dropped as a whole, unless those that come
+        next agree with it: then the robot's clock is another, and everything is measured anew. A fix whose stamp is not
+        after the last fix is dropped alone. Values that are not finite or absurdly large count as missing.
 
         Returns:
             The state at the newest stamp; None until position and heading are known.
@@ -121,15 +126,31 @@ class Estimator:
 
     def _accept_stamp(self, stamp: float) -> bool:
         """Move on to `stamp`; False if the frame is to be dropped."""
-        if not math.isfinite(stamp) or stamp <= self._stamp:
-            self.counts["stale_frame"] += 1
-            return False
-        if stamp - self._stamp > self.config.max_gap and math.isfinite(self._stamp):
-            self.counts["gap"] += 1
+        first, step = math.isinf(self._stamp), stamp - self._stamp
+        if not math.isfinite(stamp) or not (first or 0.0 < step <= self.config.max_gap):
+            if not self._other_time(stamp):
+                self.counts["stale_frame"] += 1
+                return False
+            self.counts["gap" if step > 0.0 else "clock_restart"] += 1
+            sensors, first = self._watch.sensors, True
             self.reset()
-        self._step = stamp - self._stamp if math.isfinite(self._stamp) else 0.0
-        self._stamp = stamp
+            for name in sensors:
+                self._watch.expect(name, stamp)
+        self._step = 0.0 if first else step
+        self._stamp, self._odd = stamp, 0
         return True
+
+    def _other_time(self, stamp: float) -> bool:
+        """Whether a frame whose stamp does not follow is the newest of so many in a row that the clock must differ.
+
+        Their stamps follow each other; a frame that comes again does not count.
+        """
+        step = stamp - self._odd_stamp
+        if step == 0.0 or not math.isfinite(stamp):
+            return False
+        self._odd = self._odd + 1 if 0.0 < step <= self.config.max_gap else 1
+        self._odd_stamp = stamp
+        return self._odd >= (JUMP_AFTER if stamp > self._stamp else RESTART_AFTER)
 
     def _turn(self, rotation: np.ndarray | None) -> Vector | None:
         """How the body has turned since the last frame (rotation vector, body frame [rad]), if both say it."""
@@ -299,7 +320,7 @@ class Estimator:
             return False
         self.counts[f"{sensor}_reinit"] += 1
         moved = math.hypot(*miss) > self.config.reinit_spread
-        self._restarts += moved and sensor in ("position_fix", "magnetometer")
+        self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
     def _trust(self) -> tuple[Trust, str]:
@@ -327,7 +348,7 @@ class Estimator:
             yaw_rate=self._yaw_rate - bias,
             trust=trust,
             why=why,
-            restarts=self._restarts,
+            restarts=self._starts - 1,
         )
 
 

@@ -49,6 +49,11 @@ class SensorWatch:
         self._sigma = dict(sigma)
         self._sensors: dict[str, _Sensor] = {}
 
+    @property
+    def sensors(self) -> list[str]:
+        """Those that the robot has, as far as is known."""
+        return list(self._sensors)
+
     def expect(self, name: str, stamp: float) -> None:
         """The robot has this sensor, whatever it says: it counts as silent from `stamp` [s] on until it is heard of."""
         if name not in self._sensors:

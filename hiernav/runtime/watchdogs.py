@@ -38,7 +38,7 @@ class BlindWatch:
             if math.isinf(self._stamp):
                 why = f"no position and heading for {waited:.2f} s"
                 return (Trust.LOST if waited > self.first_after else Trust.HOLD), why
-        elif estimate.stamp != self._stamp:  # earlier after the robot's clock was started again
+        elif estimate.stamp != self._stamp:  # also an earlier one: the robot's clock has started again
             self._since, self._stamp = now, estimate.stamp
             return estimate.trust, estimate.why
         age = now - self._since

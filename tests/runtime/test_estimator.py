@@ -239,7 +239,8 @@ def test_between_fixes_the_uncertainty_grows_and_a_long_gap_starts_afresh():
         estimate = estimator.update(SensorFrame(frame.stamp))
         spread.append(estimate.covariance[0, 0])
     assert all(later > earlier for earlier, later in zip(spread, spread[1:], strict=False))
-    assert estimator.update(SensorFrame(frame.stamp + 1.5)) is None
+    assert estimator.update(SensorFrame(frame.stamp + 1.5)).stamp == frame.stamp
+    assert estimator.update(SensorFrame(frame.stamp + 1.52)) is None
     assert estimator.counts["gap"] == 1
 
 

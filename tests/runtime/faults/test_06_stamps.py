@@ -1,4 +1,4 @@
-"""Stamps that repeat themselves, go backwards or are no numbers."""
+"""Stamps that repeat themselves, go backwards, jump ahead, start again or are no numbers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,29 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from puck import GOAL, Listener, Puck, Scripted, driver_of
 from runtime_motion import estimator_for, frames, recorded
+
+from hiernav.runtime.estimator import Estimate, Trust
+from hiernav.runtime.robot import SensorFrame
 
 MOTION = recorded("point")
 STREAM = list(frames(MOTION))
+AT = 60
+"""Frame with which the stamps go wrong."""
+
+
+def moved(frame: SensorFrame, seconds: float) -> SensorFrame:
+    """The frame as of a clock that is ahead by `seconds`."""
+    fix_stamp = None if frame.fix_stamp is None else frame.fix_stamp + seconds
+    return replace(frame, stamp=frame.stamp + seconds, fix_stamp=fix_stamp)
+
+
+def same(one: Estimate | None, other: Estimate | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    parts = ("stamp", "pose", "velocity", "covariance")
+    return all(np.array_equal(getattr(one, part), getattr(other, part)) for part in parts)
 
 
 @settings(max_examples=25, deadline=None)
@@ -32,7 +51,7 @@ def test_frames_from_the_past_mixed_in_change_nothing(insertions):
     assert disturbed.counts["stale_frame"] == len(late)
 
 
-@pytest.mark.parametrize("stamp", [math.nan, math.inf, -math.inf, -5.0, 0.5])
+@pytest.mark.parametrize("stamp", [math.nan, math.inf, -math.inf, -5.0, 0.5, 4.0, 1e9])
 def test_a_stamp_that_makes_no_sense_drops_its_frame(stamp):
     estimator = estimator_for(MOTION)
     for frame in STREAM[:60]:
@@ -41,3 +60,116 @@ def test_a_stamp_that_makes_no_sense_drops_its_frame(stamp):
     assert before is not None and after is not None
     assert after.stamp == before.stamp
     np.testing.assert_array_equal(after.pose, before.pose)
+
+
+@pytest.mark.parametrize("ahead", [1.5, 1e9])
+def test_one_stamp_far_ahead_costs_its_frame_alone(ahead):
+    estimator, reference = estimator_for(MOTION), estimator_for(MOTION)
+    for k, frame in enumerate(STREAM):
+        if k in (AT, AT + 2):
+            estimator.update(replace(frame, stamp=frame.stamp + ahead))
+        else:
+            assert same(estimator.update(frame), reference.update(frame))
+    assert estimator.counts["stale_frame"] == 2
+    assert not estimator.counts["gap"] and not estimator.counts["clock_restart"]
+
+
+@pytest.mark.parametrize("again", [1, 2])
+@pytest.mark.parametrize(
+    ("seconds", "dropped", "count"),
+    [(100.0, 1, "gap"), (-STREAM[AT].stamp, 9, "clock_restart"), (-1e9, 9, "clock_restart")],
+)
+def test_a_clock_that_is_another_from_now_on_is_gone_on_from_as_if_new(seconds, dropped, count, again):
+    """`again`: how often each frame is read, by a loop that is faster than the robot."""
+    estimator, fresh = estimator_for(MOTION), estimator_for(MOTION)
+    for frame in STREAM[:AT]:
+        before = estimator.update(frame)
+    later = [moved(frame, seconds) for frame in STREAM[AT:]]
+    for frame in later[:dropped]:
+        for _ in range(again):
+            assert same(estimator.update(frame), before)
+    after = None
+    for frame in later[dropped:]:
+        for _ in range(again):
+            after = estimator.update(frame)
+        assert same(after, fresh.update(frame))
+    assert after is not None and after.restarts > before.restarts
+    assert estimator.counts[count] == 1
+
+
+def test_stamps_that_do_not_follow_each_other_are_no_clock():
+    estimator = estimator_for(MOTION)
+    for frame in STREAM[:AT]:
+        before = estimator.update(frame)
+    backwards = [replace(frame, stamp=frame.stamp - 9.0) for frame in reversed(STREAM)]
+    stuck = [replace(STREAM[AT], stamp=7.0)] * 100
+    scattered = [replace(STREAM[AT], stamp=10.0 * k) for k in range(1, 100)]
+    for frame in backwards + stuck + scattered:
+        assert same(estimator.update(frame), before)
+    assert same(estimator.update(STREAM[AT]), estimator.update(STREAM[AT])) and estimator.counts["clock_restart"] == 0
+
+
+@pytest.mark.parametrize("seconds", [100.0, -1e9])
+def test_a_sensor_that_is_silent_when_the_clock_starts_again_is_missed(seconds):
+    estimator = estimator_for(MOTION)
+    for frame in STREAM[:AT]:
+        estimator.update(frame)
+    for frame in STREAM[AT:]:
+        estimate = estimator.update(replace(moved(frame, seconds), gyro=None))
+    assert estimate is not None and estimate.trust is Trust.LOST and estimate.why.startswith("gyro")
+
+
+def drive(stamp_at, every: int) -> tuple[Listener, Scripted, object]:
+    """A drive in which the frame of each stamp gets another, and only some bring a fix."""
+    reads = iter(range(10**9))
+
+    def sees(frame: SensorFrame) -> SensorFrame:
+        fix = frame.position_fix if next(reads) % every == 0 else None
+        return replace(frame, stamp=stamp_at(frame.stamp), position_fix=fix)
+
+    seen, pilot = Listener(), Scripted()
+    driver = driver_of(Puck(control_period=0.02, noise=1e-3, sees=sees), pilot, observers=[seen])
+    return seen, pilot, driver.run(GOAL)
+
+
+def test_a_robot_drives_through_one_stamp_far_ahead():
+    _, pilot, result = drive(lambda stamp: 1e9 if abs(stamp - 0.6) < 1e-6 else stamp, every=1)
+    assert result.reached and not result.holds and pilot.calls == []
+    assert result.estimator["stale_frame"] == 1
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_robot_whose_clock_starts_again_measures_its_position_anew_and_drives_on_with_another_plan(every):
+    seen, pilot, result = drive(lambda stamp: stamp + 50.0 if stamp < 0.6 else stamp - 0.6, every)
+    assert result.reached and result.estimator["clock_restart"] == 1
+    assert pilot.calls == ["drop"]
+    assert result.holds == ({"position and heading are unknown": 1} if every > 1 else {})
+    blind = [record for record in seen.records if record.estimate is None]
+    assert all(record.sent is None for record in blind) and bool(blind) == (every > 1)
+    again = next(record for record in seen.records if record.estimate is not None and record.estimate.restarts > 1)
+    assert again.frame.position_fix is not None
+    assert np.allclose(again.estimate.pose[:2], again.frame.position_fix, atol=1e-6)
+
+
+def test_a_fault_from_a_clock_that_starts_again_can_be_acknowledged():
+    """At 10 Hz the frames that must agree take longer than a robot may go without a new one."""
+    robot = Puck(noise=1e-3, sees=lambda frame: moved(frame, 50.0 if frame.stamp < 0.95 else -0.95))
+    seen = Listener()
+    driver = driver_of(robot, observers=[seen])
+    inner = driver._step
+
+    def step(now: float) -> None:
+        tick = round(10.0 * now)
+        if tick in (0, 31):
+            driver.set_goal(GOAL)
+        if tick == 30:
+            assert driver.supervisor.fault.startswith("no new sensor frame for 0.8")
+            driver.acknowledge()
+        inner(now)
+        if tick == 60:
+            driver.quit()
+
+    driver._step = step
+    driver.serve()
+    assert driver.last_result.reached
+    assert [event.values["reason"] for event in seen.events if event.kind == "end"] == ["fault", "goal"]
