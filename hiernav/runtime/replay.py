@@ -7,7 +7,6 @@ what differs first is where a difference comes from.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -229,13 +228,12 @@ class _Asked(Planner):
     def __init__(self) -> None:
         self.stamp = 0.0
         self.queries: dict[float | None, PlanQuery] = {}
-        self._order: deque[float] = deque()
 
     def plan(self, query: PlanQuery) -> None:  # type: ignore[override]
-        if len(self._order) == ASKED:
-            del self.queries[self._order.popleft()]
-        self._order.append(self.stamp)
+        self.queries.pop(self.stamp, None)  # a stamp comes again where no frame was new, or the clock started again
         self.queries[self.stamp] = kept(query)
+        if len(self.queries) > ASKED:
+            del self.queries[next(iter(self.queries))]
 
 
 def _state(estimate: Estimate | None) -> object:

@@ -12,13 +12,14 @@ from recorded_drive import BUNDLE, about, drive
 
 from hiernav import cli
 from hiernav.nav.bundle import Bundle, load_bundle
-from hiernav.nav.occupancy import empty_map
+from hiernav.nav.occupancy import VisitMap, empty_map
+from hiernav.nav.option import PlanQuery
 from hiernav.nav.recovery import Recovery
 from hiernav.runtime.log_reader import LogError, RunLog
 from hiernav.runtime.observe import Observer
 from hiernav.runtime.policy import OnnxSkill
 from hiernav.runtime.recorder import Recorder
-from hiernav.runtime.replay import Replay, _Recorded
+from hiernav.runtime.replay import ASKED, Replay, _Asked, _Recorded
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise
 from hiernav.runtime.supervisor import Mode
@@ -67,6 +68,29 @@ def test_waiting_and_recovering_are_replayed_too(tmp_path, bundle):
     result = Replay(log, bundle).compare()
     assert result.equal, result.difference
     assert result.compared["sent"] > 150
+
+
+def test_a_clock_that_starts_again_and_a_stamp_far_ahead_are_replayed_too(tmp_path, bundle):
+    def other_time(frame):
+        ahead = 1e9 if 0.49 < frame.stamp < 0.51 else 50.0 if frame.stamp < 0.7 else -0.7
+        fix_stamp = None if frame.fix_stamp is None else frame.fix_stamp + ahead
+        return replace(frame, stamp=frame.stamp + ahead, fix_stamp=fix_stamp)
+
+    log = recorded(tmp_path / "restart.mcap", {"seed": 1, "damage": other_time}, {"seed": 2})
+    estimates = [tick.estimate for tick in log.ticks()]
+    assert None in estimates[20:] and len({estimate.restarts for estimate in estimates if estimate is not None}) > 1
+    result = Replay(log, bundle).compare()
+    assert result.equal, result.difference
+    assert result.compared["sent"] > 150
+
+
+def test_questions_of_the_same_stamp_are_kept_once():
+    asked, free = _Asked(), empty_map((1.0, 1.0))
+    for k in range(3 * ASKED):
+        asked.stamp = 0.02 * (k % 300 // 2)
+        asked.plan(PlanQuery(np.full((1, 2), k), np.zeros((1, 2)), [free], [VisitMap(free)], np.zeros((1, 10, 2))))
+    assert asked.queries[asked.stamp].position[0, 0] == 3 * ASKED - 1
+    assert len(asked.queries) == 150
 
 
 @pytest.mark.parametrize(
