@@ -112,7 +112,7 @@ class Pilot:
     """One agent for one robot.
 
     With a planner that answers later, every tick in which a plan is due asks with the newest state, and the plan that
-    comes is followed from the state it was made for, unless that is older than `max_age`.
+    comes is followed from the state it was made for, unless that is older than `max_age` or of another clock.
     """
 
     def __init__(self, agent: HierarchicalAgent, link: PlannerLink | None = None, max_age: float = 1.0) -> None:
@@ -126,7 +126,7 @@ class Pilot:
         self._sound = SoundPlanner(agent.option.planner)
         agent.option.planner = self._sound
         self.late = 0
-        """Plans that were too old when they came."""
+        """Plans that were too old when they came, or from before the robot's clock started again."""
         self.reset()
 
     @property
@@ -241,7 +241,7 @@ class Pilot:
         answer = link.answer(now)
         if answer is None or not option.waiting[0]:
             return None
-        if stamp - answer.stamp > self.max_age:
+        if not 0.0 <= stamp - answer.stamp <= self.max_age:
             self.late += 1
             return None
         plan = answer.plan

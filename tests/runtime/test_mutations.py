@@ -73,7 +73,7 @@ MUTANTS = (
            f"{F}/test_09_planner_hangs.py::test_a_hanging_process_is_replaced_three_times_and_then_given_up"),
     Mutant("killed planner", f"{R}/planner_process.py", "if memory.status.restarts < MAX_RESTARTS:", "if False:",
            f"{F}/test_10_planner_killed.py"),
-    Mutant("late plan", f"{R}/pilot.py", "if stamp - answer.stamp > self.max_age:", "if False:",
+    Mutant("late plan", f"{R}/pilot.py", "if not 0.0 <= stamp - answer.stamp <= self.max_age:", "if False:",
            f"{F}/test_09_planner_hangs.py::test_an_answer_that_comes_too_late_is_not_followed"),
     Mutant("unsound plan", f"{R}/pilot.py", "if occupancy.contains(plan).all():", "if True:",
            f"{F}/test_11_unsound_plan.py"),

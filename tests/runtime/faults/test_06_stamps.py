@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from puck import GOAL, Listener, Puck, Scripted, driver_of
+from puck import GOAL, Listener, Puck, Scripted, driver_of, pilot_for
 from runtime_motion import estimator_for, frames, recorded
 
+from hiernav.nav.planners import StraightPlanner
 from hiernav.runtime.estimator import Estimate, Trust
 from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.supervisor import Mode
 
 MOTION = recorded("point")
 STREAM = list(frames(MOTION))
@@ -149,6 +151,21 @@ def test_a_robot_whose_clock_starts_again_measures_its_position_anew_and_drives_
     again = next(record for record in seen.records if record.estimate is not None and record.estimate.restarts > 1)
     assert again.frame.position_fix is not None
     assert np.allclose(again.estimate.pose[:2], again.frame.position_fix, atol=1e-6)
+
+
+def test_a_plan_from_before_the_clock_started_again_is_not_followed():
+    """It is asked for while the robot is armed, and comes once the robot knows where it is now."""
+
+    def sees(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < 0.1:
+            return moved(frame, 50.0)
+        return moved(frame if frame.stamp > 0.35 else replace(frame, position_fix=None), -0.1)
+
+    seen, robot = Listener(), Puck(control_period=0.02, noise=1e-3, sees=sees)
+    pilot = pilot_for(StraightPlanner(), 0.5, period=0.02)
+    assert driver_of(robot, pilot, observers=[seen]).run(GOAL).reached
+    assert pilot.late == 1
+    assert all(record.plan_age >= 0.0 for record in seen.records if record.mode is Mode.RUNNING)
 
 
 def test_a_fault_from_a_clock_that_starts_again_can_be_acknowledged():
