@@ -13,7 +13,7 @@ import websockets.asyncio.server
 
 from hiernav.runtime import messages
 from hiernav.runtime.observe import TickRecord
-from hiernav.view.commands import MAX_BYTES, Command, Settings
+from hiernav.view.commands import MAX_BYTES, Asker, Command, Settings
 
 OWN_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost):\d+")
 
@@ -25,13 +25,7 @@ def main(descriptor: int) -> None:
 
     with socket.socket(fileno=descriptor) as link:
         settings = msgspec.json.decode(link.recv(MAX_BYTES), type=Settings)
-
-        def ask(command: Command) -> None:
-            try:
-                link.send(msgspec.json.encode(command), socket.MSG_DONTWAIT)
-            except OSError:
-                pass  # the loop is too busy, or gone; either will show
-
+        ask = Asker(link)
         page = Page(settings, ask)
         ask(Command("ready", text=page.url))
         decoder = messages.TickDecoder()

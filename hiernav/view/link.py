@@ -1,7 +1,7 @@
 """The control loop's side of the live page: shows ticks to a process of its own, and takes commands from it.
 
-Nothing here waits. A page that is stalled misses ticks, one that floods is heard a few times a tick, and one that has
-died is forgotten; the robot drives on.
+Nothing here waits. A page that is stalled misses ticks, of one that floods a few commands a tick are obeyed, and one
+that has died is forgotten; the robot drives on. An emergency stop does not wait for what the page said before it.
 """
 
 from __future__ import annotations
@@ -23,17 +23,22 @@ import numpy as np
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime import messages
 from hiernav.runtime.observe import Event, Observer, TickRecord
-from hiernav.view.commands import MAX_BYTES, Command, Settings
+from hiernav.view.commands import COMMAND_BYTES, MAX_BYTES, Command, Settings
 
 SHOW_HZ = 20.0
 """Ticks shown a second."""
 COMMANDS_PER_TICK = 4
+"""Commands that are obeyed in a tick, emergency stops aside; more are refused."""
+PAGE_BUFFER, HEARD_PER_TICK = 65536, 256
+"""Of the page's end of the socket [bytes], and messages that are taken from it in a tick: more than it holds."""
 LARGEST_MAP = 1_000_000
 """Pixels of a map that is shown as it is; a larger one is shown coarser."""
 START_SECONDS = 30.0
 """What the page's process is given to come up, before the robot moves [s]."""
 
 PROGRAM = (sys.executable, "-m", "hiernav.view")
+
+_decode = msgspec.json.Decoder(Command).decode
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +85,7 @@ class ViewerLink(Observer):
             raise ValueError("the live page needs viser: install it with `pip install 'hiernav[view]'`")
         self.control, self.faults = control, dict(faults or {})
         self.shown = self.dropped = self.refused = 0
-        """Ticks shown, messages the page was too slow for, and commands that made no sense."""
+        """Ticks shown, messages the page was too slow for, and commands that made no sense or were too many."""
         self.first_goal: np.ndarray | None = None
         """(2,) goal to set at the first tick [m]."""
         self._encoder = messages.TickEncoder()
@@ -89,6 +94,7 @@ class ViewerLink(Observer):
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket: socket.socket | None = ours
         with theirs:
+            theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, PAGE_BUFFER)
             # In a session of its own: Ctrl-C is for the loop, which then closes the socket.
             self._process = subprocess.Popen(
                 [*program, str(theirs.fileno())],
@@ -106,9 +112,7 @@ class ViewerLink(Observer):
         if self.first_goal is not None:
             self.control.set_goal(self.first_goal)
             self.first_goal = None
-        for _ in range(COMMANDS_PER_TICK):
-            if not self._take_command():
-                break
+        self._take_commands()
         if abs(record.time - self._shown_at) < 1.0 / SHOW_HZ:
             return
         self._shown_at = record.time
@@ -163,31 +167,44 @@ class ViewerLink(Observer):
             self._forget()
         return False
 
-    def _take_command(self) -> bool:
-        """Do what the page asks for next; False if it asks for nothing."""
+    def _take_commands(self) -> None:
+        """Do what the page asks for, as far as it does not ask too often."""
+        left = COMMANDS_PER_TICK
+        for _ in range(HEARD_PER_TICK):
+            data = self._receive()
+            if data is None:
+                return
+            try:
+                command = _decode(data)
+                if command.kind == "estop":
+                    self.control.estop("stopped on the live page")
+                elif left:
+                    left -= 1
+                    self._obey(command)
+                else:
+                    self.refused += 1
+            except (msgspec.DecodeError, ValueError, KeyError):
+                self.refused += 1
+
+    def _receive(self) -> bytes | None:
+        """What the page says next; None if it says nothing."""
         if self._socket is None:
-            return False
+            return None
         try:
-            data = self._socket.recv(MAX_BYTES)
+            data = self._socket.recv(COMMAND_BYTES)
         except BlockingIOError:
-            return False
+            return None
         except OSError:
             data = b""
         if not data:
             self._forget()
-            return False
-        try:
-            self._obey(msgspec.json.decode(data, type=Command))
-        except (msgspec.DecodeError, ValueError, KeyError):
-            self.refused += 1
-        return True
+            return None
+        return data
 
     def _obey(self, command: Command) -> None:
         match command.kind:
             case "goal":
                 self.control.set_goal(np.array([command.x, command.y]))
-            case "estop":
-                self.control.estop("stopped on the live page")
             case "fault":
                 self.faults[command.text]()
             case "cancel" | "pause" | "resume" | "acknowledge":

@@ -106,8 +106,11 @@ MUTANTS = (
            "if False:", f"{F}/test_19_disk_full.py"),
     Mutant("size of a picture", "hiernav/nav/mapfile.py", "if width * height > MAX_PIXELS:", "if False:",
            f"{F}/test_25_impossible_map.py"),
-    Mutant("flood from the page", "hiernav/view/link.py", "for _ in range(COMMANDS_PER_TICK):",
-           "for _ in range(10**6):", "tests/view/test_link.py"),
+    Mutant("flood from the page", "hiernav/view/link.py", "elif left:", "elif True:", "tests/view/test_link.py"),
+    Mutant("endless flood from the page", "hiernav/view/link.py", "for _ in range(HEARD_PER_TICK):",
+           "for _ in range(10**9):", "tests/view/test_link.py"),
+    Mutant("stop in a flood from the page", "hiernav/view/commands.py", 'if command.kind == "estop":', "if False:",
+           "tests/view/test_link.py"),
     Mutant("limit of requests", f"{R}/driver.py", "deque(maxlen=REQUESTS)", "deque()", f"{F}/test_29_viewer_stalls.py"),
 )  # fmt: skip
 

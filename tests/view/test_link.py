@@ -2,49 +2,24 @@
 
 from __future__ import annotations
 
+import socket
 import sys
+import threading
 import time
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
+from page_stub import Asked, link_to
 
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime import messages
-from hiernav.runtime.observe import TickRecord
+from hiernav.runtime.observe import Event, TickRecord
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
-from hiernav.view.link import COMMANDS_PER_TICK, ViewerLink, coarser
-
-PREAMBLE = """
-import json, socket, sys, time
-link = socket.socket(fileno=int(sys.argv[-1]))
-settings = json.loads(link.recv(100000))
-def say(**values): link.send(json.dumps(values).encode())
-say(kind="ready", text="http://127.0.0.1:1")
-"""
-
-
-class Asked:
-    """Notes what it is asked for."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple] = []
-
-    def set_goal(self, goal):
-        if not np.isfinite(goal).all():
-            raise ValueError("goal")
-        self.calls.append(("goal", *goal.tolist()))
-
-    def estop(self, why):
-        self.calls.append(("estop",))
-
-    def __getattr__(self, name):
-        return lambda: self.calls.append((name,))
-
-
-def link_to(program: str, control=None, **settings) -> ViewerLink:
-    return ViewerLink(control or Asked(), 0.1, 0.3, program=(sys.executable, "-c", PREAMBLE + program), **settings)
+from hiernav.view.commands import MAX_BYTES, Asker, Command
+from hiernav.view.link import COMMANDS_PER_TICK, HEARD_PER_TICK, ViewerLink, coarser
 
 
 def record(index: int, **changes) -> TickRecord:
@@ -67,16 +42,24 @@ def ticks_until(link: ViewerLink, done, limit: float = 30.0) -> int:
     return index
 
 
+def until(done, limit: float = 30.0) -> None:
+    deadline = time.monotonic() + limit
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
 def test_a_page_is_shown_ticks_as_they_are_and_its_wishes_are_granted(tmp_path):
     out = tmp_path / "seen"
     control, injected = Asked(), []
     link = link_to(
         f"""
 for kind in ("pause", "resume", "cancel", "acknowledge", "estop"): say(kind=kind)
-say(kind="goal", x=1.5, y=-2.0)
-say(kind="fault", text="flood")
 with open({str(out)!r}, "ab", buffering=0) as file:
     while data := link.recv(1000000):
+        if data.startswith(b"/event"):
+            say(kind="goal", x=1.5, y=-2.0)
+            say(kind="fault", text="flood")
         file.write(len(data).to_bytes(4, "little") + data)
 """,
         control,
@@ -84,6 +67,8 @@ with open({str(out)!r}, "ab", buffering=0) as file:
     )
     assert link.url == "http://127.0.0.1:1"
     link.first_goal = np.array([0.5, 0.5])
+    ticks_until(link, lambda: len(control.calls) == 6)
+    link.event(Event(0.0, "stop", "the robot stands"))
     ticks_until(link, lambda: injected and link.shown > 5)
     link.close()
     assert control.calls == [
@@ -95,7 +80,7 @@ with open({str(out)!r}, "ab", buffering=0) as file:
         topic, _, body = data[4 : 4 + size].partition(b"\n")
         read.append(decoder.add(messages.decode(topic.decode(), body)))
         data = data[4 + size :]
-    read = [item for item in read if item is not None]
+    read = [item for item in read if isinstance(item, TickRecord)]
     assert len(read) == link.shown
     for item in read:
         np.testing.assert_array_equal(item.occupancy.occupied, record(item.index).occupancy.occupied)
@@ -111,7 +96,7 @@ def test_a_page_that_takes_nothing_any_more_misses_ticks_and_nobody_waits():
     link.close()
 
 
-def test_a_page_that_floods_is_heard_a_few_times_a_tick():
+def test_of_a_page_that_floods_a_few_commands_a_tick_are_obeyed():
     control = Asked()
     link = link_to(
         """
@@ -129,12 +114,82 @@ time.sleep(1000)
     for index in range(200):
         calls, refused = len(control.calls), link.refused
         link.tick(record(index))
-        assert len(control.calls) - calls + link.refused - refused <= COMMANDS_PER_TICK
+        assert len(control.calls) - calls <= COMMANDS_PER_TICK
+        assert len(control.calls) - calls + link.refused - refused <= HEARD_PER_TICK
         time.sleep(0.001)
     assert {call[0] for call in control.calls} == {"goal"} and len(control.calls) > 20
     assert link.refused > 80
     link._process.kill()
     link.close()
+
+
+def test_an_emergency_stop_is_obeyed_in_the_tick_in_which_it_is_found_whatever_was_said_before_it(tmp_path):
+    control, said = Asked(), tmp_path / "said"
+    link = link_to(
+        f"""
+for k in range(100): say(kind="goal", x=float(k), y=0.0)
+say(kind="estop")
+open({str(said)!r}, "w").close()
+time.sleep(1000)
+""",
+        control,
+    )
+    until(said.exists)
+    link.tick(record(0))
+    assert control.calls == [("goal", float(k), 0.0) for k in range(COMMANDS_PER_TICK)] + [("estop",)]
+    assert link.refused == 100 - COMMANDS_PER_TICK
+    link._process.kill()
+    link.close()
+
+
+def test_all_that_can_wait_on_the_socket_is_heard_in_one_tick(tmp_path):
+    control, full = Asked(), tmp_path / "full"
+    link = link_to(
+        f"""
+try:
+    while True: link.send(b'{{"kind":"pause"}}', socket.MSG_DONTWAIT)
+except BlockingIOError:
+    open({str(full)!r}, "w").close()
+time.sleep(1000)
+""",
+        control,
+    )
+    until(full.exists)
+    link.tick(record(0))
+    assert link.refused > 100
+    assert link._receive() is None
+    link._process.kill()
+    link.close()
+
+
+def test_an_emergency_stop_that_finds_the_socket_full_waits_for_it_and_what_is_asked_for_later_is_lost():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        ours.settimeout(30.0)
+        ask = Asker(theirs)
+        for k in range(1000):
+            ask(Command("goal", float(k)))
+        stopping = threading.Thread(target=ask, args=(Command("estop"),))
+        stopping.start()
+        until(ask._stopping.locked)
+        ours.recv(MAX_BYTES)  # there is room for one more
+        ask(Command("cancel"))
+        kinds = []
+        while "estop" not in kinds:
+            kinds.append(msgspec.json.decode(ours.recv(MAX_BYTES), type=Command).kind)
+        assert set(kinds[:-1]) == {"goal"}
+        stopping.join()
+        ask(Command("cancel"))
+        assert msgspec.json.decode(ours.recv(MAX_BYTES), type=Command).kind == "cancel"
+
+
+def test_what_a_page_says_to_a_loop_that_is_gone_is_lost_without_waiting():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.close()
+    with theirs:
+        ask = Asker(theirs)
+        for kind in ("goal", "estop", "cancel"):
+            ask(Command(kind))
 
 
 def test_a_page_that_dies_is_forgotten():
