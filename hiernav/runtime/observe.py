@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -96,50 +94,6 @@ class Observer:
 
     def flush(self, timeout: float) -> None:
         """The run is over and the robot braked: bring to safety what was collected, within `timeout` [s]."""
-
-
-class Background(Observer):
-    """Lets an observer work in a thread of its own, however slow it is; what it cannot keep up with is dropped."""
-
-    def __init__(self, observer: Observer, capacity: int = 512) -> None:
-        """`capacity`: records and events that may wait; of more, the oldest are dropped."""
-        self.observer = observer
-        self.dropped = 0
-        self._waiting: deque[Callable[[], None]] = deque(maxlen=capacity)
-        self._news = threading.Semaphore(0)
-        self._flushed = threading.Event()
-        threading.Thread(target=self._work, name=f"observer {type(observer).__name__}", daemon=True).start()
-
-    def tick(self, record: TickRecord) -> None:
-        self._leave(lambda: self.observer.tick(record))
-
-    def event(self, event: Event) -> None:
-        self._leave(lambda: self.observer.event(event))
-
-    def flush(self, timeout: float) -> None:
-        self._flushed.clear()
-        self._leave(lambda: self.observer.flush(timeout))
-        self._leave(self._flushed.set)
-        if not self._flushed.wait(timeout):
-            log.error("%s has not caught up within %g s", type(self.observer).__name__, timeout)
-
-    def _leave(self, work: Callable[[], None]) -> None:
-        self.dropped += len(self._waiting) == self._waiting.maxlen
-        self._waiting.append(work)
-        self._news.release()
-
-    def _work(self) -> None:
-        while True:
-            self._news.acquire()
-            try:
-                self._waiting.popleft()()
-            except IndexError:  # it was dropped
-                continue
-            except Exception:
-                log.exception("observer failed and is dropped")
-                self._waiting = deque(maxlen=1)
-                self._flushed.set()
-                return
 
 
 class Audience:
