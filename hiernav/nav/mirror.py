@@ -88,7 +88,7 @@ _ACROSS_X: dict[str, Rule] = {
     "goal": _flip(-1, 1),
 }
 _OWN: dict[str, Rule] = {
-    "clock": _flip(1, 1),
+    "clock": _flip(-1, -1),  # half a period later: what the left legs did then, the right ones do now
     "rear_rotation": _flip(1, -1, -1, -1, 1, 1, -1, 1, 1),
     "rear_velocity": _flip(1, -1, -1),
     "joint_sin": (_JOINTS, [1.0] * 12),

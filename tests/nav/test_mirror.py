@@ -10,7 +10,7 @@ import pytest
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.observation import clock_phase, observation_layout
+from hiernav.nav.observation import CLOCK_HZ, clock_phase, observation_layout
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
@@ -49,7 +49,8 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
             "lidar": lidar_closeness(sim.pose, discs),
             "waypoints": world_to_body(plans, sim.pose).reshape(2, -1),
             "goal": world_to_body(goals[:, None], sim.pose)[:, 0],
-            "clock": clock_phase(sim.time),
+            # the left and the right legs step in turn: the twin's clock goes half a period behind
+            "clock": clock_phase(sim.time + np.array([0.0, 0.5 / CLOCK_HZ])),
         }
         return layout.build(values)
 
