@@ -132,6 +132,7 @@ class Driver:
         self._trip: Trip | None = None
         self._ended: Trip | None = None
         self._estimate: Estimate | None = None
+        self._restarts: int | None = None
         self._paused = self._serving = False
         self._stop_wanted: str | None = None
         self._held_since = 0.0
@@ -215,7 +216,7 @@ class Driver:
         self._trip, self._ended, self._paused = None, None, False
         self.gone = None
         self._told: tuple[str, str | None] = ("", None)
-        self._estimate, self._restarts = None, 0
+        self._estimate, self._restarts = None, None
         self._last_frame: SensorFrame | None = None
         self._occupancy: OccupancyMap | None = None
         self._loop_ticks = self.loop.ticks
@@ -303,21 +304,22 @@ class Driver:
         self._take_requests(now)
         trust, doubt = self._blind.check(estimate, now)
         late = self._overruns.check(self.loop.overruns_in_a_row)
+        stamp = frame.stamp if estimate is None else estimate.stamp
         occupancy = decision = sent = None
         scale = 1.0
         if self._trip is not None:
-            self._trip.last = frame.stamp
+            self._trip.last = stamp
         if trust is Trust.LOST and self._trip is not None:
             self._fail(doubt, now)
         if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
-            occupancy = self._occupancy = self.occupancy(frame.stamp)
+            occupancy = self._occupancy = self.occupancy(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
                 decision = self._decide(self._trip, frame, estimate, occupancy, now)
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
-            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else late, frame.stamp, now)
+            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else late, stamp, now)
         if supervisor.driving and decision is not None and estimate is not None and occupancy is not None:
             sent, scale = self._send(decision, estimate, occupancy, now)
         if sent is None:
@@ -341,7 +343,8 @@ class Driver:
         supervisor, trip = self.supervisor, self._trip
         if supervisor.mode is Mode.INIT:
             supervisor.change(Mode.READY, "position and heading known", now)
-            self._restarts = estimate.restarts
+            if self._restarts is None:
+                self._restarts = estimate.restarts
         if supervisor.mode is Mode.READY and trip is not None and not self._paused:
             try:
                 trip.goal = place_goal(occupancy, estimate.pose[:2], trip.goal, self.config.goal_tolerance)

@@ -312,6 +312,23 @@ def test_a_robot_that_is_gone_ends_the_service():
     assert len(robot.log) < 50 and robot.log[-1] == "brake"
 
 
+def test_a_plan_from_before_the_robot_was_lost_is_not_followed():
+    """The robot is armed, with a plan on its way, when its clock jumps: it must be found anew."""
+    pilot = Scripted(changes=lambda step: {"has_plan": step > 8})
+
+    def jump(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < 0.45:
+            return frame
+        return replace(frame, stamp=frame.stamp + 10.0, position_fix=None if frame.stamp < 0.85 else frame.position_fix)
+
+    listener = Listener()
+    driver = driver_of(Puck(sees=jump), pilot, observers=[listener])
+    assert driver.run(GOAL).reached
+    modes = [event.values["mode"] for event in listener.events if event.kind == "mode"]
+    assert modes[:5] == ["ready", "armed", "init", "ready", "armed"]
+    assert pilot.calls.count("drop") == 1
+
+
 def test_each_run_starts_the_agent_afresh():
     agent, robot = Scripted(), Puck()
     driver = driver_of(robot, agent)
