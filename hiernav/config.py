@@ -146,7 +146,14 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reward_scale: Annotated[float, Meta(gt=0, description="Factor on the reward that the critics learn from.")] = 1.0
     eval_every_steps: Annotated[int, Meta(ge=1, description="Steps between evaluations.")] = 10_000
     eval_episodes: Annotated[int, Meta(ge=1, description="Episodes per evaluation.")] = 100
-    checkpoint_every_steps: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 5_000
+    checkpoint_every_steps: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="Steps between checkpoints, at which all episodes begin anew; "
+            "about 150 of every simulation where that is more.",
+        ),
+    ] = 5_000
     stop_reach_rate: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
         Meta(description="Stop once an evaluation reaches this rate; null: never."),

@@ -22,6 +22,8 @@ from hiernav.skill.env import NavigationEnv
 
 _BATCH_FRAMES = 128
 """Steps collected by one process between two bursts of updates, at least one per simulation."""
+_SEGMENT_STEPS = 150
+"""Steps of every simulation that a segment is made of at least: its end cuts all episodes short."""
 
 
 class Batches(Protocol):
@@ -89,6 +91,12 @@ def make_batches(config: TrainConfig, policy: ProbabilisticActor, planner: Plann
 def frames_of_batch(num_envs: int, frames: int) -> int:
     """Steps of a batch of `num_envs` simulations, where `frames` steps are wanted in all."""
     return num_envs * max(1, min(_BATCH_FRAMES, frames) // num_envs)
+
+
+def segment_frames(skill: SkillConfig, steps: int) -> int:
+    """Steps wanted of the segment that begins after so many, summed over the simulations of all workers."""
+    rows = skill.num_envs * (1 if skill.collector == "local" else skill.workers)
+    return min(max(skill.checkpoint_every_steps, _SEGMENT_STEPS * rows), skill.total_steps - steps)
 
 
 def random_batches(config: TrainConfig, steps: int, frames: int) -> int:

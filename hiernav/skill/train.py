@@ -1,6 +1,6 @@
 """Training of the skill: batches from torchrl's collectors, a replay buffer on disk, and the learner.
 
-The run is cut into segments of `checkpoint_every_steps`. Each one starts from freshly drawn episodes and ends with a
+The run is cut into segments of `segment_frames`. Each one starts from freshly drawn episodes and ends with a
 checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved.
 """
 
@@ -29,7 +29,7 @@ from hiernav.sim.reward import TERMS
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import run_episodes
 from hiernav.sim.worlds import sample_layout
-from hiernav.skill.collect import make_batches
+from hiernav.skill.collect import make_batches, segment_frames
 from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.networks import Actor
 from hiernav.skill.replay import Replay, mirror_half
@@ -203,7 +203,7 @@ class SkillTrainer:
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
         skill, began, first, updates = self.config.skill, time.perf_counter(), self.steps, self.learner.updates
-        frames = min(skill.checkpoint_every_steps, skill.total_steps - self.steps)
+        frames = segment_frames(skill, self.steps)
         window: list[TensorDict] = []
         try:
             with closing(self.batches.segment(self.steps, frames)) as batches:

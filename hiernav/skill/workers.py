@@ -21,7 +21,7 @@ from torchrl.modules import ProbabilisticActor
 from hiernav.config import TrainConfig
 from hiernav.nav.option import Planner
 from hiernav.run import WorkersLost
-from hiernav.skill.collect import frames_of_batch, random_batches
+from hiernav.skill.collect import frames_of_batch, random_batches, segment_frames
 from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.machines import Machines, Weights, find_machines
 
@@ -36,8 +36,7 @@ class WorkerBatches:
     def __init__(self, config: TrainConfig, policy: ProbabilisticActor, planner: Planner | None = None) -> None:
         self.config, self.policy, self.planner = config, policy, planner
         skill = config.skill
-        frames = min(skill.checkpoint_every_steps, skill.total_steps)
-        self.share = frames_of_batch(skill.num_envs, frames // skill.workers)
+        self.share = frames_of_batch(skill.num_envs, segment_frames(skill, 0) // skill.workers)
         self.frames = self.share * skill.workers
         self.workers: list[Worker] = []
         self._machines: Machines | None = None

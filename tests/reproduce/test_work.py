@@ -60,7 +60,7 @@ def test_a_fixed_period_is_what_lies_between_plans():
 
 @pytest.mark.train
 def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys):
-    size = replace(SMOKE, training=(*SMOKE.training, "skill.total_steps=192"))
+    size = replace(SMOKE, training=(*SMOKE.training, "skill.num_envs=1", "skill.total_steps=384"))
     cell = next(c for c in catalogue(ROOT, size, 1, ["point"]) if c.id == "sample_efficiency/point-ours-0")
 
     def stop(share: float, what: str) -> None:
@@ -71,9 +71,9 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
         run_cell(cell, places, stop)
     capsys.readouterr()
     outcome = run_cell(cell, places, lambda *_: None)
-    assert "going on after step 64 of 192" in capsys.readouterr().out
-    assert [point["step"] for point in outcome.curves["evaluation"]] == [64, 128, 192]
-    assert outcome.settings["skill.total_steps"] == 192 and "run_dir" not in outcome.settings
+    assert "going on after step 128 of 384" in capsys.readouterr().out
+    assert [point["step"] for point in outcome.curves["evaluation"]] == [128, 256, 384]
+    assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
 
 

@@ -1,14 +1,17 @@
-"""Which worlds a segment of training draws its episodes from."""
+"""How long a segment of training is, and which worlds it draws its episodes from."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from hiernav.config import load_config
-from hiernav.skill.collect import training_layouts, training_worlds
+from hiernav.skill.collect import segment_frames, training_layouts, training_worlds
 
 pytestmark = pytest.mark.train
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 WORLDS = ["pillar(2,2,5)", "gremlin", "two-room"]
 CONFIG = load_config(None, [f"skill.worlds={WORLDS}", "skill.total_steps=1000", "skill.learning_starts=0"])
 PHASED = load_config(None, [*(f"skill.{k}" for k in (f"worlds={WORLDS}", "phase_in=0.4", "total_steps=4000"))])
@@ -21,6 +24,24 @@ def test_worlds_are_added_one_at_a_time(steps: int, count: int) -> None:
 
 def test_without_phasing_in_all_worlds_are_there_from_the_start() -> None:
     assert len(training_worlds(CONFIG.skill, 0)) == 3
+
+
+@pytest.mark.parametrize(
+    ("robot", "settings", "frames"),
+    [
+        *[("point", [], 5_000), ("car", [], 5_000), ("doggo", [], 20_000)],
+        ("doggo", ["skill.workers=32"], 20_000),  # whom nobody asks
+        ("doggo", ["skill.collector=multi", "skill.workers=32"], 150 * 32 * 32),
+        ("point", ["skill.num_envs=512"], 150 * 512),
+        ("point", ["skill.num_envs=512", "skill.checkpoint_every_steps=90_000"], 90_000),
+    ],
+)
+def test_a_segment_leaves_every_simulation_the_steps_of_an_episode(
+    robot: str, settings: list[str], frames: int
+) -> None:
+    skill = load_config(CONFIGS / f"{robot}.yaml", settings).skill
+    assert segment_frames(skill, 0) == frames
+    assert segment_frames(skill, skill.total_steps - 32) == 32
 
 
 def test_every_segment_and_every_worker_has_episodes_of_its_own() -> None:

@@ -97,6 +97,13 @@ def test_a_run_does_all_its_steps_evaluates_and_logs(straight):
     assert straight.learner.updates == 51
 
 
+def test_many_simulations_make_segments_longer_than_checkpoints_were_asked_for(tmp_path):
+    trainer = trainer_in(tmp_path / "run", "skill.num_envs=4", "skill.checkpoint_every_steps=8")
+    trainer.train()
+    # whole batches of 128 steps out of 4 times 150
+    assert [line["step"] for line in metrics_of(tmp_path / "run") if line["stage"] == "skill"] == [512, 768]
+
+
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(straight, interrupted):
     resumed, folder, _ = interrupted
     ours, theirs = flat(straight.learner.state_dict()), flat(resumed.learner.state_dict())
@@ -109,8 +116,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(straight, interrup
 def test_the_replay_is_on_disk_while_it_is_needed(straight, interrupted):
     _, folder, found = interrupted
     replay = {name: size for name, size in found.items() if name.startswith("skill/replay/")}
-    # 768 transitions and a batch of simulations, two observations of 42 float32 each
-    assert sum(replay.values()) > 776 * 2 * 42 * 4
+    # 768 transitions and a batch, two observations of 42 float32 each
+    assert sum(replay.values()) >= (768 + 128) * 2 * 42 * 4
     assert not (folder / "skill" / "replay").exists() and not (straight.run.path / "skill" / "replay").exists()
 
 

@@ -161,7 +161,8 @@ def test_a_batch_holds_all_shares_in_order_collected_by_the_weights_of_its_time(
     ("settings", "share"),
     [
         (["skill.num_envs=8", "skill.checkpoint_every_steps=5000"], 128),
-        (["skill.num_envs=8", "skill.checkpoint_every_steps=128"], 64),
+        (["skill.num_envs=8", "skill.checkpoint_every_steps=128"], 128),
+        (["skill.num_envs=8", "skill.total_steps=128", "skill.learning_starts=0"], 64),
         (["skill.num_envs=48", "skill.checkpoint_every_steps=5000"], 96),
         (["skill.num_envs=500", "skill.checkpoint_every_steps=100"], 500),
     ],
