@@ -38,9 +38,8 @@ WHAT = {
     "no-invalid-rule": "plans that meet the map are kept", "paper-reward": "the paper's reward",
     "one-world": "trained in pillar(2,2,10) alone, as in the paper", "no-phase-in": "all worlds from the start",
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
-    "no-alpha-floor": "no floor of the temperature", "whole-episodes": "training episodes run to the cap",
-    "no-tilt-cost": "no cost of tilting", "no-time-cost": "no cost of time",
-    "go-on-after-fall": "training goes on after a fall",
+    "no-alpha-floor": "no floor of the temperature", "no-tilt-cost": "no cost of tilting",
+    "no-time-cost": "no cost of time", "go-on-after-fall": "training goes on after a fall",
     "no-clock": "no gait clock", "layer-norm": "with layer normalisation in the critics",
     "learned-plans": "trained with the network's plans",
 }  # fmt: skip

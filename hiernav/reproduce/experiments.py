@@ -71,7 +71,6 @@ TRAINING = {
     "no-mirror": ["skill.mirror=false"],
     "no-average": ["skill.actor_average=0"],
     "no-alpha-floor": ["skill.alpha_floor=0"],
-    "whole-episodes": ["skill.episode_steps=null"],
     "no-tilt-cost": ["reward.tilt=0"],
     "no-time-cost": ["reward.time=0"],
     "go-on-after-fall": ["skill.end_on_fall=false"],
