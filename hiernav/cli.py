@@ -262,7 +262,8 @@ def _train(arguments: argparse.Namespace) -> int:
         with _progress() as progress:
             train(run, arguments.stage, progress)
     except KeyboardInterrupt:
-        print(f"stopped; go on from the last checkpoint with: hiernav train --resume {run.path}", file=sys.stderr)
+        again = f"hiernav train --resume {run.path}" + (arguments.stage != "all") * f" --stage {arguments.stage}"
+        print(f"stopped; go on from the last checkpoint with: {again}", file=sys.stderr)
         return INTERRUPTED
     finally:
         run.close()

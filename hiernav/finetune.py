@@ -95,8 +95,11 @@ def _run_states(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             raise RunError(f"{path} has no trained {stage}: go on with `hiernav train --resume {path}`")
     planner, skill = states["planner"], states["skill"]
     assert planner is not None and skill is not None
-    # the lengths of the source's logs say nothing about those of the new run
-    return planner["network"], {key: value for key, value in skill.items() if not key.endswith("_length")}
+    if skill["best_actor"] is None:
+        raise RunError(f"the skill of {path} has not been evaluated yet: go on with `hiernav train --resume {path}`")
+    # the lengths of the source's logs say nothing about those of the new run, and its replay stays where it is
+    kept = {key: value for key, value in skill.items() if not key.endswith("_length")}
+    return planner["network"], {**kept, "imported": True}
 
 
 def _bundle_states(bundle: Bundle) -> tuple[dict[str, Any], dict[str, Any]]:

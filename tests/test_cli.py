@@ -357,7 +357,7 @@ def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, ca
     _, errors = train.communicate(timeout=60)
     assert train.returncode == 130, errors
     assert errors.rstrip().splitlines()[-1] == (
-        f"stopped; go on from the last checkpoint with: hiernav train --resume {run}"
+        f"stopped; go on from the last checkpoint with: hiernav train --resume {run} --stage skill"
     )
     assert "Traceback" not in errors
     assert cli.main(["train", "--stage", "skill", "--resume", str(run)]) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -72,11 +73,31 @@ def test_what_the_networks_were_trained_for_cannot_be_changed(able_run: Path, tm
     assert not (tmp_path / "tuned").exists()
 
 
-def test_a_bundle_s_skill_drives_but_cannot_be_trained_on(able_bundle: Path, tmp_path: Path, capsys):
-    assert cli.main(command(able_bundle, tmp_path / "tuned")) == 0
+def unfinished(run: Path, folder: Path, **changes: object) -> Path:
+    """A copy of a run whose skill was left halfway."""
+    shutil.copytree(run, folder)
+    copy = Run.open(folder)
+    copy.save("skill", {**copy.load("skill"), "steps": 512, **changes})
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["run", "unfinished run", "bundle"])
+def test_a_skill_from_elsewhere_drives_but_cannot_be_trained_on(
+    able_run: Path, able_bundle: Path, tmp_path: Path, capsys, kind: str
+):
+    source = {"run": able_run, "bundle": able_bundle}.get(kind) or unfinished(able_run, tmp_path / "unfinished")
+    assert cli.main(command(source, tmp_path / "tuned")) == 0
+    assert cli.main(["train", "--resume", str(tmp_path / "tuned"), "--stage", "planner"]) == 0
     assert cli.main(["train", "--resume", str(tmp_path / "tuned")]) == 2
-    assert "comes from a bundle" in capsys.readouterr().err
+    assert "comes from another run or a bundle" in capsys.readouterr().err
     assert cli.main(["evaluate", "--run", str(tmp_path / "tuned"), "--world", tiny_run.WORLD, "--episodes", "2"]) == 0
+
+
+def test_a_skill_that_was_never_evaluated_is_not_taken_over(able_run: Path, tmp_path: Path, capsys):
+    source = unfinished(able_run, tmp_path / "unfinished", best_actor=None)
+    assert cli.main(command(source, tmp_path / "tuned")) == 2
+    assert f"has not been evaluated yet: go on with `hiernav train --resume {source}`" in capsys.readouterr().err
+    assert not (tmp_path / "tuned").exists()
 
 
 def test_a_planner_of_other_layers_is_refused(tmp_path: Path, able_run: Path, capsys):

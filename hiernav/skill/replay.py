@@ -27,7 +27,9 @@ class Replay:
 
     def __init__(self, folder: Path, size: int, observation: int, action: int, batch_size: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        if (folder / "meta.json").exists():
+        self.fresh = not (folder / "meta.json").exists()
+        """Whether its files were made just now, so that nothing is in them whatever a checkpoint says."""
+        if not self.fresh:
             self._data = TensorDict.load_memmap(folder)
         else:
             example = TensorDict(

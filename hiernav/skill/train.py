@@ -143,9 +143,10 @@ class SkillTrainer:
         self.learner = make_learner(config)
         self.batches = make_batches(config, self.learner.policy, planner)
         layout, self._robot = skill_layout(config), get_robot(config.robot)
+        self._replay_folder = run.path / "skill" / "replay"
         with run.writing():
             self.replay = Replay(
-                run.path / "skill" / "replay",
+                self._replay_folder,
                 min(skill.buffer_size, skill.total_steps + self.batches.frames),
                 layout.size,
                 self._robot.action_dim,
@@ -160,12 +161,18 @@ class SkillTrainer:
         self._episodes = _Episodes()
 
     def resume(self) -> int | None:
-        """Go back to the last checkpoint; its number of steps, or None if there is none."""
+        """Go back to the last checkpoint; its number of steps, or None if there is none.
+
+        Raises:
+            RunError: the skill cannot be trained on: it is another run's or a bundle's, or its replay is gone.
+        """
         state = self.run.load("skill", rewind=True)
         if state is None:
             return None
         if state.get("imported"):
-            raise RunError(f"the skill of {self.run.path} comes from a bundle: it drives, but cannot be trained on")
+            raise RunError(
+                f"the skill of {self.run.path} comes from another run or a bundle: it drives, but cannot be trained on"
+            )
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         restore_random_state(state, self.learner.device)
@@ -174,6 +181,13 @@ class SkillTrainer:
         self.evaluations, self.best_actor = state["evaluations"], state["best_actor"]
         self._episodes.reached.extend(state["reached"])
         self._episodes.steps.extend(state["episode_steps"])
+        if self.replay.fresh and len(self.replay) and not self.finished:
+            shutil.rmtree(self._replay_folder)  # else it would be taken for the lost one the next time
+            raise RunError(
+                f"{self._replay_folder} is missing, without which the skill cannot be trained on from step "
+                f"{self.steps:,}: copy it from where the run was made; a finished training leaves none, so begin a new "
+                "run to train for longer"
+            )
         return self.steps
 
     @property
@@ -199,7 +213,7 @@ class SkillTrainer:
                 if self.steps >= self._next_evaluation() or self.steps >= self.config.skill.total_steps:
                     self._evaluate()
                 self._save()
-        shutil.rmtree(self.run.path / "skill" / "replay", ignore_errors=True)
+        shutil.rmtree(self._replay_folder, ignore_errors=True)
 
     def _segment(self, on_progress: Callable[[Progress], None] | None) -> None:
         skill, began, first, updates = self.config.skill, time.perf_counter(), self.steps, self.learner.updates

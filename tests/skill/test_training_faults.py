@@ -7,6 +7,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -166,6 +167,31 @@ def test_a_disk_without_room_for_the_replay_is_reported_at_once(tmp_path, monkey
     with pytest.raises(RunError, match="cannot be written to .No space left on device.* make room"):
         SkillTrainer(run.config, run)
     assert not (run.path / "skill" / "replay").exists()
+
+
+def test_a_training_does_not_go_on_without_its_replay(trained, at_step, tmp_path):
+    def stop(_: SkillTrainer) -> None:
+        raise KeyboardInterrupt
+
+    run, copy = tmp_path / "run", tmp_path / "copy"
+    at_step(384, stop)
+    assert trained()[0] == cli.INTERRUPTED
+    shutil.copytree(run, copy)
+    shutil.rmtree(copy / "skill" / "replay")
+    for _ in range(2):  # what the first attempt has made is not taken for the lost one by the second
+        code, line = trained("--resume", str(copy))
+        assert code == cli.BAD_INPUT
+        assert line.startswith(f"hiernav train: {copy / 'skill' / 'replay'} is missing, ") and "from step 256: " in line
+    shutil.copytree(run / "skill" / "replay", copy / "skill" / "replay")
+    assert trained("--resume", str(copy))[0] == 0
+
+
+def test_a_finished_training_is_not_made_longer(trained_run, trained, tmp_path):
+    run = Path(shutil.copytree(trained_run, tmp_path / "longer"))
+    longer = (run / "config.yaml").read_text().replace("total_steps: 768", "total_steps: 1024")
+    (run / "config.yaml").write_text(longer)
+    code, line = trained("--resume", str(run))
+    assert code == cli.BAD_INPUT and "begin a new run to train for longer" in line
 
 
 KILLED_IN_A_SEGMENT = """
