@@ -38,6 +38,8 @@ from hiernav.skill.sac import Learner, SacSettings
 _WINDOW = 200
 """Episodes that running means are taken over."""
 _EVALUATION_SEED = 0xE7A1
+_COLLISION = 0.01
+"""Share of an arrival that a collision costs where actors are compared."""
 _LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
 
 
@@ -101,23 +103,31 @@ def alpha_floor(skill: SkillConfig, steps: int) -> float:
 
 def merit(evaluation: dict[str, float]) -> tuple[float, float]:
     """What makes one evaluation better than another: reach rate less a hundredth per collision, then fewer steps."""
-    return evaluation["reach_rate"] - 0.01 * evaluation["collisions_mean"], -evaluation["steps_mean"]
+    return evaluation["reach_rate"] - _COLLISION * evaluation["collisions_mean"], -evaluation["steps_mean"]
 
 
 def kept(evaluations: Sequence[dict[str, float]], episodes: int) -> dict[str, float]:
     """The evaluation of the actor that a training leaves: the last that is not worse by more than chance explains.
 
-    That is two standard errors of a difference of reach rates, of `episodes` each. Taking whichever evaluation is the
+    That is two standard errors of the difference in merit, of `episodes` each. Taking whichever evaluation is the
     highest would take the luckiest instead, and give away what was learned after it.
     """
     chosen = best = evaluations[0]
     for evaluation in evaluations[1:]:
-        rate = 0.5 * (evaluation["reach_rate"] + best["reach_rate"])
-        chance = 2.0 * (2.0 * rate * (1.0 - rate) / episodes) ** 0.5
+        chance = 2.0 * ((_merit_variance(evaluation, episodes) + _merit_variance(best, episodes)) / episodes) ** 0.5
         if merit(evaluation)[0] >= merit(best)[0] - chance:
             chosen = evaluation
         best = max(best, evaluation, key=merit)
     return chosen
+
+
+def _merit_variance(evaluation: dict[str, float], episodes: int) -> float:
+    """Variance of the merit of single episodes, with one more that arrived and one more that did not: never 0."""
+    rate = evaluation["reach_rate"]
+    # evaluations of older runs know the variance of arrivals alone
+    mean, variance = merit(evaluation)[0], evaluation.get("merit_std", (rate * (1.0 - rate)) ** 0.5) ** 2
+    squares = (episodes * (variance + mean**2) + 1.0) / (episodes + 2)
+    return squares - ((episodes * mean + 1.0) / (episodes + 2)) ** 2
 
 
 class TorchSkill:
@@ -317,11 +327,13 @@ class SkillTrainer:
         layouts = [sample_layout(worlds[i % len(worlds)], int(seed), radius) for i, seed in enumerate(seeds)]
         task = make_task(self.config, min(64, skill.eval_episodes), self.planner)
         episodes = run_episodes(task, TorchSkill(self.learner.average), layouts)
+        reached, collisions = (np.array([getattr(e, name) for e in episodes]) for name in ("reached", "collisions"))
         result = {
             "step": self.steps,
-            "reach_rate": float(np.mean([e.reached for e in episodes])),
+            "reach_rate": float(reached.mean()),
             "steps_mean": float(np.mean([e.steps_counted for e in episodes])),
-            "collisions_mean": float(np.mean([e.collisions for e in episodes])),
+            "collisions_mean": float(collisions.mean()),
+            "merit_std": float((reached - _COLLISION * collisions).std()),
             "return_mean": float(np.mean([e.return_ for e in episodes])),
         }
 

@@ -146,6 +146,31 @@ def test_more_episodes_leave_less_to_chance():
     assert kept(evaluations(0.99, 0.97), 1000)["step"] == 0
 
 
+def measured(step, collisions, spread, rate=1.0):
+    """An evaluation of robots that touch something in so many steps of an episode, give or take `spread`."""
+    merit_std = ((rate * (1.0 - rate)) + (0.01 * spread) ** 2) ** 0.5
+    return {
+        "step": step, "reach_rate": rate, "collisions_mean": collisions, "merit_std": merit_std, "steps_mean": 50.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "step"),
+    [
+        (measured(20_000, 0.30, 0.5), measured(100_000, 0.31, 0.5), 100_000),  # all arrive: chance does not vanish
+        (measured(20_000, 0.30, 0.5), measured(100_000, 5.0, 1.0), 20_000),
+        (measured(20_000, 0.30, 0.5), measured(100_000, 5.0, 25.0), 100_000),  # a few that were stuck explain it
+        (measured(20_000, 0.30, 0.5), measured(100_000, 0.30, 0.5, rate=0.9), 20_000),
+    ],
+)
+def test_chance_covers_collisions_too_and_remains_where_all_arrive(first, second, step):
+    assert kept([first, second], 100)["step"] == step
+
+
+def test_an_evaluation_says_how_much_single_episodes_differ(straight):
+    assert any(0.0 < evaluation["merit_std"] < 1.0 for evaluation in straight.evaluations)
+
+
 def test_the_best_actor_is_what_a_run_leaves(straight):
     state = Run.open(straight.run.path).load("skill")
     best = load_actor(straight.config, state)
