@@ -51,8 +51,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shards: tuple[Shard, ...]
 
     @property
+    def made(self) -> int:
+        """Samples that are there."""
+        return sum(shard.samples for shard in self.shards)
+
+    @property
     def finished(self) -> bool:
-        return sum(shard.samples for shard in self.shards) == self.samples
+        return self.made == self.samples
 
 
 def write_dataset(
@@ -130,10 +135,11 @@ def read_dataset(
         DatasetError: it has fewer samples, is unfinished, or a shard is missing, altered or of other shapes.
     """
     manifest = read_manifest(folder)
-    there = sum(shard.samples for shard in manifest.shards)
     count = manifest.samples if count is None else count
-    if count > there:
-        raise DatasetError(f"{folder} has {there:,} samples, {count:,} are wanted: let `hiernav dataset` go on with it")
+    if count > manifest.made:
+        raise DatasetError(
+            f"{folder} has {manifest.made:,} samples, {count:,} are wanted: let `hiernav dataset` go on with it"
+        )
     samples, done = Samples.empty(manifest.settings, count), 0
     for shard in manifest.shards:
         if done == count:

@@ -71,7 +71,7 @@ def measure(
         ],
     )
     run = Run.open(run_dir) if (run_dir / "config.yaml").exists() else Run.create(config)
-    if not (data / "dataset.json").exists() or read_manifest(data).samples < samples:
+    if not (data / "dataset.json").exists() or read_manifest(data).made < samples:
         made = label_settings(config)
         write_dataset(data, made, samples, data_seed(config), threads, lambda done: show("data set", done, samples))
     trainer = PlannerTrainer(run.config, run)

@@ -1,0 +1,40 @@
+"""Claims about entries of the waypoint generator's table: one that was interrupted goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
+
+from hiernav.planner import store  # noqa: E402
+from hiernav.planner import train as planner_train  # noqa: E402
+from hiernav.planner.store import read_manifest  # noqa: E402
+from hiernav.planner.table import measure  # noqa: E402
+
+pytestmark = pytest.mark.train
+SETTINGS = ("planner.samples_per_world=4", "planner.epochs=1", "planner.batch_size=8")
+
+
+def entry(folder: Path, samples: int) -> dict:
+    return measure(folder, samples, "paper", 0, world="pillar(1.2,1.2,2)", episodes=2, threads=1, settings=SETTINGS)
+
+
+def test_an_entry_whose_data_set_was_interrupted_goes_on_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(store, "_SHARD_SAMPLES", 8)
+    monkeypatch.setattr(planner_train, "_WALKS", 2)
+    make_shard = store._make_shard
+
+    def interrupted(*task):
+        if task[3] == 1:
+            raise KeyboardInterrupt
+        return make_shard(*task)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(store, "_make_shard", interrupted)
+        entry(tmp_path, 24)
+    manifest = read_manifest(tmp_path / "data-paper-0")
+    assert (manifest.samples, manifest.made) == (24, 8)
+    assert entry(tmp_path, 24)["samples"] == 24
+    assert read_manifest(tmp_path / "data-paper-0").finished
