@@ -146,7 +146,7 @@ class SkillTrainer:
 
     def __init__(self, config: TrainConfig, run: Run, planner: Planner | None = None) -> None:
         self.config, self.run, self.planner = config, run, planner
-        self._plans: dict[str, int] = {}
+        self._plans = self._plan_counts()
         skill = config.skill
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
         torch.manual_seed(int(seeds[0]))
@@ -307,11 +307,16 @@ class SkillTrainer:
         }
 
     def _new_plans(self) -> dict[str, float]:
-        """Proposals, repairs and refusals of a network that plans in this process, since the last time."""
-        if not isinstance(self.planner, VerifiedPlanner):
+        """Proposals, repairs and refusals in training, since the last time."""
+        before, self._plans = self._plans, self._plan_counts()
+        return {f"plans/{name}": float(count - before[name]) for name, count in self._plans.items()}
+
+    def _plan_counts(self) -> dict[str, int]:
+        """Of a network that plans for the simulations of this process; empty where the plans are made elsewhere."""
+        if self.config.skill.collector != "local" or not isinstance(self.planner, VerifiedPlanner):
             return {}
-        before, self._plans = self._plans, self.planner.counts()
-        return {f"plans/{name}": float(self._plans[name] - before.get(name, 0)) for name in COUNTS}
+        counts = self.planner.counts()
+        return {name: counts[name] for name in COUNTS}
 
     def _next_evaluation(self) -> float:
         every = self.config.skill.eval_every_steps
@@ -341,6 +346,7 @@ class SkillTrainer:
         if kept(self.evaluations, skill.eval_episodes) is result:
             self.best_actor = {key: value.clone() for key, value in self.learner.average.state_dict().items()}
         self.run.log("evaluation", self.steps, {k: v for k, v in result.items() if k != "step"})
+        self._plans = self._plan_counts()  # those of the evaluation are not the training's
 
     def _save(self) -> None:
         self.run.save(

@@ -14,6 +14,8 @@ import tiny_run
 torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
+from hiernav.nav.option import Planner  # noqa: E402
+from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner, VerifiedPlanner  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
 from hiernav.skill import train as skill_train  # noqa: E402
 from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, kept, load_actor  # noqa: E402
@@ -21,16 +23,21 @@ from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDive
 pytestmark = pytest.mark.train
 
 
-def trainer_in(folder: Path, *overrides: str) -> SkillTrainer:
+def trainer_in(folder: Path, *overrides: str, planner: Planner | None = None) -> SkillTrainer:
     run = Run.create(tiny_run.config(folder, *overrides))
-    return SkillTrainer(run.config, run)
+    return SkillTrainer(run.config, run, planner)
 
 
-def reopened(folder: Path) -> SkillTrainer:
+def reopened(folder: Path, planner: Planner | None = None) -> SkillTrainer:
     """A trainer in another process that goes on with a run: nothing is left of the first one but its files."""
     torch.manual_seed(99)
     run = Run.open(folder)
-    return SkillTrainer(run.config, run)
+    return SkillTrainer(run.config, run, planner)
+
+
+def verified() -> VerifiedPlanner:
+    """A planner that counts its proposals and repairs."""
+    return VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(), 0.1)
 
 
 def at_step(steps: int, act: Callable[[], None]) -> Callable[[Progress], None]:
@@ -111,6 +118,28 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(straight, interrup
     assert [key for key in ours if not torch.equal(ours[key], theirs[key])] == []
     assert resumed.evaluations == straight.evaluations
     assert (folder / "metrics.jsonl").read_bytes() == (straight.run.path / "metrics.jsonl").read_bytes()
+
+
+def test_plans_are_counted_alike_whether_or_not_a_run_was_interrupted_and_without_those_of_evaluations(tmp_path):
+    settings = ("skill.checkpoint_every_steps=384", "skill.updates_per_step=0.02")
+    straight = trainer_in(tmp_path / "straight", *settings, planner=verified())
+    straight.train()
+    with pytest.raises(KeyboardInterrupt):
+        trainer_in(tmp_path / "interrupted", *settings, planner=verified()).train(at_step(512, interrupt))
+    resumed = reopened(tmp_path / "interrupted", verified())
+    assert resumed.resume() == 384 and len(resumed.evaluations) == 1
+    resumed.train()
+    ours, theirs = (metrics_of(tmp_path / name) for name in ("straight", "interrupted"))
+    assert ours == theirs and len(ours) == 4
+    counted = sum(line["plans/proposals"] for line in ours if line["stage"] == "skill")
+    assert 0 < counted < straight.planner.proposals
+
+
+def test_plans_that_workers_make_are_not_counted_here(tmp_path):
+    trainer = trainer_in(tmp_path / "run", "skill.collector=multi", planner=verified())
+    trainer.planner.proposals += 1  # as an evaluation does
+    assert trainer._new_plans() == {}
+    trainer.batches.close()
 
 
 def test_the_replay_is_on_disk_while_it_is_needed(straight, interrupted):
