@@ -349,7 +349,7 @@ sys.exit(main(["train", "run_dir=run"]))
 
 @pytest.mark.train
 def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, capsys):
-    settings = ("skill.total_steps=3840", "skill.checkpoint_every_steps=128", "skill.eval_every_steps=3840")
+    settings = ("skill.total_steps=7680", "skill.eval_every_steps=7680")
     run = tmp_path / "run"
     train = start("train", "--stage", "skill", *tiny_run.arguments(run, *settings))
     await_file(run / "skill" / "checkpoint.pt", train)
@@ -363,8 +363,8 @@ def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, ca
     assert cli.main(["train", "--stage", "skill", "--resume", str(run)]) == 0
     assert f"run folder: {run}" in capsys.readouterr().out
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if line["stage"] == "skill"] == list(range(128, 3841, 128))
-    assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [3840]
+    assert [line["step"] for line in lines if line["stage"] == "skill"] == list(range(256, 7681, 256))
+    assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [7680]
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
