@@ -18,6 +18,7 @@ _ENDINGS = {
     "goal": "goal reached",
     "left_field": "left the field",
     "timeout": "ran out of steps",
+    "fallen": "lay on its back",
     "physics": "physics not finite",
 }
 

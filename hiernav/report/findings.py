@@ -54,7 +54,10 @@ def shortfalls(book: Book, robot: str) -> list[str]:
     return sentences
 
 
-_ENDINGS = {"timeout": "reaching the cap on steps", "left_field": "leaving the field", "physics": "diverging physics"}
+_ENDINGS = {
+    "timeout": "reaching the cap on steps", "fallen": "lying on its back at the cap on steps",
+    "left_field": "leaving the field", "physics": "diverging physics",
+}  # fmt: skip
 
 
 def _blame(book: Book, robot: str, world: str, interval: tuple[float, float]) -> str:

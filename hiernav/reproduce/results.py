@@ -82,7 +82,7 @@ class Drive(msgspec.Struct, frozen=True, kw_only=True):
     return_mean: float
     steps_between_plans: float | None
     endings: dict[str, int]
-    """How often episodes ended by each of "goal", "left_field", "timeout", "physics"."""
+    """How often episodes ended by each of "goal", "left_field", "timeout", "fallen", "physics" (`Episode.reason`)."""
     proposals: int = 0
     repairs: int = 0
 

@@ -22,7 +22,7 @@ class Episode:
     seed: int
     reached: bool
     reason: str
-    """"goal", "left_field", "timeout" or "physics"."""
+    """"goal", "left_field", "timeout", "fallen" (a timeout, on its back) or "physics"."""
     steps: int
     cap: int
     collisions: int
@@ -105,7 +105,7 @@ def run_episodes(
             episode = Episode(
                 seed=layout.seed,
                 reached=bool(step.reached[row]),
-                reason=_reason(step, row),
+                reason=_reason(step, row, fallen=bool(task.sim.upright[row] < 0.0)),
                 steps=int(task.steps[row]),
                 cap=layout.spec.max_steps,
                 collisions=int(collisions[row]),
@@ -140,9 +140,11 @@ def shortest_length(layout: Layout, radius: float) -> float:
     return max(0.0, float(arc_lengths(field.smooth(path)[None])[0, -1]) - GOAL_RADIUS)
 
 
-def _reason(step: TaskStep, row: int) -> str:
+def _reason(step: TaskStep, row: int, fallen: bool) -> str:
     if step.broken[row]:
         return "physics"
     if step.reached[row]:
         return "goal"
-    return "left_field" if step.left[row] else "timeout"
+    if step.left[row]:
+        return "left_field"
+    return "fallen" if fallen else "timeout"

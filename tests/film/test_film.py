@@ -129,10 +129,10 @@ def test_the_caption_tells_how_an_episode_ended():
         Episode(
             0, reason == "goal", reason, 9, 10, 0, 0.0, 1.0, 1.0, REPLANS, refused=0, recoveries=0, plan_seconds=0.0
         )
-        for reason in ("goal", "left_field", "timeout", "physics")
+        for reason in ("goal", "left_field", "timeout", "fallen", "physics")
     ]
     strips = [caption(LEAST_WIDTH, "world", "step 9", REPLANS, episode) for episode in (None, *episodes)]
-    assert len({strip.tobytes() for strip in strips}) == 5
+    assert len({strip.tobytes() for strip in strips}) == 6
     assert len({strip.shape for strip in strips}) == 1
 
 

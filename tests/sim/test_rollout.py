@@ -98,6 +98,22 @@ def test_a_policy_that_fails_counts_the_cap_and_no_spl() -> None:
     assert episode.path_length == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("quaternion", "reason"), [((1.0, 0.0, 0.0, 0.0), "timeout"), ((0.0, 1.0, 0.0, 0.0), "fallen")]
+)
+def test_a_robot_that_lies_on_its_back_at_the_cap_has_fallen(quaternion: tuple[float, ...], reason: str) -> None:
+    config = TrainConfig(robot="doggo")
+    task = make_task(config, 1, worlds=[WORLD])
+
+    def lie(observation: np.ndarray) -> np.ndarray:
+        task.sim.datas[0].qpos[3:7] = quaternion
+        return np.zeros((1, task.robot.action_dim))
+
+    episode = run_episodes(task, lie, [capped(layout_of(start=(-1.0, -1.0, 0.0)), 3)])[0]
+    assert (episode.reached, episode.reason) == (False, reason)
+    assert (episode.steps, episode.steps_counted) == (3, 3)
+
+
 def test_leaving_the_field_early_counts_the_cap_as_well() -> None:
     episode = run(ahead, [layout_of(start=(1.5, -1.0, 0.0))])[0]
     assert (episode.reached, episode.reason) == (False, "left_field")
