@@ -2,7 +2,7 @@
 
     config.yaml       every value of the configuration
     metrics.jsonl     one JSON object per line: stage, step, values; the same for the same seed
-    rates.jsonl       how fast the machine was, likewise
+    rates.jsonl       how fast the machine was, and how long each stage has taken, likewise
     tensorboard/      both as curves
     planner/, skill/  checkpoints of the two stages
     summary.json      outcome
@@ -48,6 +48,7 @@ class Run:
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
         self._writer: Any = None
+        self._began: dict[str, float] = {}
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
@@ -80,8 +81,18 @@ class Run:
         """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves `stage/...`."""
         self._append("metrics.jsonl", stage, step, values, stage)
 
+    def start_clock(self, stage: str) -> None:
+        """Count the seconds of a stage from here on, after those that other processes have spent on it."""
+        self._began[stage] = time.perf_counter() - spent_seconds(self.path, stage)
+
+    def seconds(self, stage: str) -> float:
+        """What a stage whose clock was started has taken so far, whatever processes worked on it."""
+        return time.perf_counter() - self._began[stage]
+
     def log_rates(self, stage: str, step: int, values: Mapping[str, float]) -> None:
         """Append what depends on the machine to `rates.jsonl` and to the curves `rates/stage/...`."""
+        if stage in self._began:
+            values = {**values, "seconds": round(self.seconds(stage), 3)}
         self._append("rates.jsonl", stage, step, values, f"rates/{stage}")
 
     def save(self, stage: str, state: Mapping[str, Any]) -> None:
@@ -164,6 +175,21 @@ class Run:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def spent_seconds(folder: Path, stage: str) -> float:
+    """What a stage has taken in all processes that worked on it, as its run folder tells; 0 if there is none."""
+    summary, rates = folder / "summary.json", folder / "rates.jsonl"
+    outcome = json.loads(summary.read_text()).get(stage, {}) if summary.exists() else {}
+    seconds, step = 0.0, 0
+    whole, _, _ = rates.read_text().rpartition("\n") if rates.exists() else ("", "", "")  # the last may be half a line
+    for line in map(json.loads, whole.splitlines()):
+        if line["stage"] == stage:
+            # older runs tell only how fast they were
+            rate = line.get("steps_per_second")
+            seconds = line.get("seconds") or seconds + ((line["step"] - step) / rate if rate else 0.0)
+            step = line["step"]
+    return max(seconds, outcome.get("seconds", 0.0))
 
 
 def newest_run(folder: str | Path = "runs") -> Path:

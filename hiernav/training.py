@@ -36,9 +36,9 @@ def train(run: Run, stage: str, progress: Progress) -> None:
     if done and not planner.finished:
         _say_resumed(progress, run, "planner", f"epoch {done} of {run.config.planner.epochs}")
     if stage in ("planner", "all") and not planner.finished:
-        began = time.perf_counter()
+        run.start_clock("planner")
         planner.train(_PlannerDisplay(progress))
-        run.summarize({"planner": {**planner.validation, "seconds": round(time.perf_counter() - began, 1)}})
+        run.summarize({"planner": {**planner.validation, "seconds": round(run.seconds("planner"), 1)}})
     if stage in ("skill", "all"):
         guide: Planner | None = None
         if run.config.skill.planner == "cnn":
@@ -55,10 +55,10 @@ def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
     steps = skill.resume()
     if steps is not None and not skill.finished:
         _say_resumed(progress, run, "skill", f"step {steps:,} of {run.config.skill.total_steps:,}")
-    began = time.perf_counter()
+    run.start_clock("skill")
     skill.train(_SkillDisplay(progress))
     shipped = skill_train.kept(skill.evaluations, run.config.skill.eval_episodes)
-    run.summarize({"skill": {**shipped, "seconds": round(time.perf_counter() - began, 1)}})
+    run.summarize({"skill": {**shipped, "seconds": round(run.seconds("skill"), 1)}})
 
 
 def _say_resumed(progress: Progress, run: Run, stage: str, done: str) -> None:

@@ -22,7 +22,10 @@ SKILL = {
 }  # fmt: skip
 PLANNER = {"loss", "error", "blocked_waypoints", "walk_collisions", "walk_reach_rate"}
 EVALUATION = {"reach_rate", "steps_mean", "collisions_mean", "return_mean"}
-RATES = {"skill/steps_per_second", "skill/updates_per_second", "planner/samples_per_second"}
+RATES = {
+    "skill/steps_per_second", "skill/updates_per_second", "planner/samples_per_second", "skill/seconds",
+    "planner/seconds",
+}  # fmt: skip
 
 
 def lines(file: Path) -> list[dict]:

@@ -11,7 +11,7 @@ import tiny_run
 
 from hiernav import run as run_module
 from hiernav.config import ConfigError, load_config
-from hiernav.run import Run, RunError, newest_run, write_atomically
+from hiernav.run import Run, RunError, newest_run, spent_seconds, write_atomically
 
 
 @pytest.fixture
@@ -87,6 +87,37 @@ def test_summaries_of_the_stages_are_merged(run):
         "planner": {"error": 0.05},
         "skill": {"reach_rate": 0.5},
     }
+
+
+@pytest.mark.train
+def test_seconds_of_a_stage_are_those_of_all_processes_that_worked_on_it(run, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(run_module.time, "perf_counter", lambda: now[0])
+    run.start_clock("skill")
+    now[0] += 40.0
+    run.log_rates("skill", 200, {"steps_per_second": 10.0})
+    now[0] += 3.0  # lost: the process is stopped
+    again = Run.open(run.path)
+    now[0] += 1000.0
+    again.start_clock("skill")
+    now[0] += 2.0
+    again.log_rates("skill", 220, {"steps_per_second": 10.0})
+    assert spent_seconds(run.path, "skill") == 42.0 and spent_seconds(run.path, "planner") == 0.0
+    run.summarize({"skill": {"seconds": 50.0}})
+    assert spent_seconds(run.path, "skill") == 50.0, "the evaluation at the end is in the summary alone"
+    again.close()
+
+
+def test_seconds_of_a_run_that_tells_only_its_rates_are_those_of_its_steps(run):
+    (run.path / "rates.jsonl").write_text(
+        '{"stage": "planner", "step": 1, "samples_per_second": 9.0}\n'
+        '{"stage": "skill", "step": 200, "steps_per_second": 10.0}\n'
+        '{"stage": "skill", "step": 300, "steps_per_second": 20.0}\n'
+        '{"stage": "skill", "st'
+    )
+    assert spent_seconds(run.path, "skill") == 25.0
+    run.summarize({"skill": {"seconds": 0.0}})
+    assert spent_seconds(run.path, "skill") == 25.0
 
 
 @pytest.mark.train

@@ -76,6 +76,7 @@ def measure(
         write_dataset(data, made, samples, data_seed(config), threads, lambda done: show("data set", done, samples))
     trainer = PlannerTrainer(run.config, run)
     trainer.resume()
+    run.start_clock("planner")
     total = config.planner.epochs * samples
     trainer.train(lambda now: show("training", now.done, total) if now.stage == "training" else None)
     run.close()

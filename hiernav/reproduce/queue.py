@@ -14,8 +14,17 @@ from typing import Literal
 from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
-from hiernav.reproduce.results import Machine, Result, ResultError, git_state, read_result, this_machine, write_result
-from hiernav.reproduce.work import Outcome, Report
+from hiernav.reproduce.results import (
+    Machine,
+    Result,
+    ResultError,
+    code_differs,
+    git_state,
+    read_result,
+    this_machine,
+    write_result,
+)
+from hiernav.reproduce.work import Outcome, Report, trained_seconds
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
 """`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
@@ -106,19 +115,15 @@ def look_up(cell: Cell, places: Places) -> Entry:
 class Estimates:
     """Durations of cells, corrected by how long others of their kind took on this machine."""
 
-    def __init__(self, entries: Sequence[Entry], machine: Machine) -> None:
+    def __init__(self, entries: Sequence[Entry], machine: Machine, places: Places) -> None:
         self._expected, self._taken = defaultdict[str, float](float), defaultdict[str, float](float)
         for entry in entries:
             result = entry.result
-            if (
-                result is not None
-                and entry.state == "done"
-                and (result.machine.cpu, result.machine.cores)
-                == (
-                    machine.cpu,
-                    machine.cores,
-                )
-            ):
+            if result is None or entry.state != "done":
+                continue
+            here = (result.machine.cpu, result.machine.cores) == (machine.cpu, machine.cores)
+            # one that took less than its training did counts the last process of several alone
+            if here and result.seconds >= trained_seconds(entry.cell, places):
                 self.learn(entry.cell, result.seconds)
 
     def learn(self, cell: Cell, seconds: float) -> None:
@@ -142,9 +147,8 @@ class Queue:
         self.cells, self.places = list(cells), places
         self._execute = execute
         self._machine = this_machine()
-        # of the code as it was loaded, whatever is committed while the queue runs
         self._commit, self._dirty = git_state(places.root, places.results)
-        self.estimate = Estimates(self.entries(), self._machine)
+        self.estimate = Estimates(self.entries(), self._machine, places)
 
     def entries(self) -> list[Entry]:
         """Every cell as it stands."""
@@ -183,13 +187,14 @@ class Queue:
 
     def _run(self, cell: Cell, watcher: Watcher, tally: Tally) -> None:
         key, started, began = cell_key(cell, self.places), time.strftime("%Y-%m-%dT%H:%M:%S%z"), time.monotonic()
+        trained_before, (commit, dirty) = trained_seconds(cell, self.places), self._code()
         watcher.began(cell, self.estimate(cell))
         outcome, error = Outcome({}, {}, dict(cell.settings)), None
         try:
             outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what))
         except CellFailed as failure:
             error = str(failure)
-        seconds = time.monotonic() - began
+        seconds = trained_before + time.monotonic() - began
         if cell_key(cell, self.places) != key:
             tally.skipped[cell.id] = why = "its bundle was replaced meanwhile: run it again"
             watcher.ended(cell, None, why)
@@ -206,8 +211,8 @@ class Queue:
             command=cell.command,
             settings=outcome.settings,
             source=outcome.source,
-            commit=self._commit,
-            dirty=self._dirty,
+            commit=commit,
+            dirty=dirty,
             started=started,
             seconds=round(seconds, 1),
             machine=self._machine,
@@ -222,6 +227,14 @@ class Queue:
         else:
             tally.failed[cell.id] = error
         watcher.ended(cell, result, None)
+
+    def _code(self) -> tuple[str | None, bool | None]:
+        """Commit of a cell that starts now, and whether it runs other code: what drives was loaded with the queue, what
+        trains is read when a cell starts."""
+        commit, dirty = git_state(self.places.root, self.places.results)
+        if commit is None or self._commit is None:
+            return commit, dirty
+        return commit, dirty or self._dirty or code_differs(self.places.root, self._commit, commit)
 
     def _why_not(self, cell: Cell, left: float | None) -> str | None:
         """Why a cell cannot be started, if so."""

@@ -49,12 +49,14 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     settings: dict[str, Any]
     """What was measured, and of a training each setting that differs from the defaults."""
     source: dict[str, Any]
-    """The policies: bundle and hashes, or run folder."""
+    """The policies: bundle and hashes, or run folder, and the commits of the processes that trained in it."""
     commit: str | None
+    """When the cell started."""
     dirty: bool | None
-    """Whether tracked files differed from the commit."""
+    """Whether tracked files differed from the commit, or code that was loaded before did."""
     started: str
     seconds: float
+    """What it took; of a training that was stopped and went on, all of it."""
     machine: Machine
     metrics: dict[str, Any] = {}
     curves: dict[str, list[dict[str, float | None]]] = {}
@@ -228,6 +230,11 @@ def git_state(root: Path, results: Path) -> tuple[str | None, bool | None]:
     except (OSError, subprocess.CalledProcessError):
         return None, None
     return commit, bool(changes.strip())
+
+
+def code_differs(root: Path, before: str, after: str) -> bool:
+    """Whether the package is not the same in two commits."""
+    return before != after and bool(_git(root, "diff", "--name-only", before, after, "--", "hiernav").strip())
 
 
 def _git(root: Path, *arguments: str) -> str:

@@ -17,8 +17,10 @@ from hiernav.config import OptionConfig, RewardConfig, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
-from hiernav.reproduce.cells import Cell, Places, bundle_hashes
+from hiernav.reproduce.cells import Cell, Places, bundle_hashes, cell_key
 from hiernav.reproduce.experiments import differences
+from hiernav.reproduce.results import git_state
+from hiernav.run import spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 
@@ -26,6 +28,8 @@ Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done."""
 
 EVALUATION_SEED = 0
+
+_COMMITS = "commits.txt"
 
 WALKERS = {"network": ("cnn", False), "verified": ("cnn", True), "astar": ("astar", False)}
 """Whose plans are walked along: planner, and whether what collides is repaired."""
@@ -51,6 +55,46 @@ def run_cell(cell: Cell, places: Places, report: Report) -> Outcome:
         "walk": _walk,
         "film": _film,
     }[cell.kind](cell, places, report)
+
+
+def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
+    """Run folder that a cell trains, and the stages that it trains there; none for cells that train nothing."""
+    if cell.kind == "table2":
+        return places.runs / "table2" / cell.name, ("planner",)
+    if cell.kind == "finetune":
+        return places.runs / f"{cell.experiment}-{cell.name}-{cell_key(cell, places)[:8]}", ("planner",)
+    if cell.kind != "train" or cell.run is None:
+        return places.runs, ()
+    stage = cell.settings["stage"]
+    return places.runs / cell.run, ("planner", "skill") if stage == "all" else (stage,)
+
+
+def trained_seconds(cell: Cell, places: Places) -> float:
+    """What the training of a cell has taken so far, as its run folder tells."""
+    folder, stages = training_of(cell, places)
+    return sum(spent_seconds(folder, stage) for stage in stages)
+
+
+def _noting_commit(folder: Path, places: Places, report: Report) -> Report:
+    """`report`, which before it first says something of a training notes in the run folder what trains there."""
+    noted = False
+
+    def note(share: float, what: str) -> None:
+        nonlocal noted
+        if not noted:
+            commit, dirty = git_state(places.root, places.results)
+            with (folder / _COMMITS).open("a") as file:
+                file.write(f"{commit or 'no repository'}{' with changes' if dirty else ''}\n")
+            noted = True
+        report(share, what)
+
+    return note
+
+
+def _commits(folder: Path) -> list[str]:
+    """Of the processes that trained in a run folder, as far as they noted it; each once, in order."""
+    file = folder / _COMMITS
+    return list(dict.fromkeys(file.read_text().splitlines())) if file.exists() else []
 
 
 def driven(
@@ -134,19 +178,18 @@ def _evaluate(cell: Cell, places: Places, report: Report) -> Outcome:
 def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
     """Fine-tune the planner on the cell's world, then drive there."""
     from hiernav.finetune import begin_fine_tuning, fine_tuning_config
-    from hiernav.reproduce.cells import cell_key
 
     assert cell.world is not None
     source, about = _policies(cell, places)
-    folder = places.runs / f"{cell.experiment}-{cell.name}-{cell_key(cell, places)[:8]}"
+    folder, _ = training_of(cell, places)
     if not (folder / "planner" / "checkpoint.pt").exists():
         # begun and not even saved: there is nothing to go on with
         (folder / "config.yaml").unlink(missing_ok=True)
         overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
-    _train_run(folder, "planner", report)
+    _train_run(folder, "planner", _noting_commit(folder, places, report))
     metrics = driven(open_policies(folder), cell.world, cell.settings, report)
-    return Outcome(metrics, {**about, "fine_tuned": folder.name}, cell.settings)
+    return Outcome(metrics, {**about, "fine_tuned": folder.name, "commits": _commits(folder)}, cell.settings)
 
 
 def _train(cell: Cell, places: Places, report: Report) -> Outcome:
@@ -154,13 +197,13 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
     from hiernav.run import Run
 
     assert cell.run is not None and cell.config is not None
-    folder, stage = places.runs / cell.run, cell.settings["stage"]
+    folder, stage = training_of(cell, places)[0], cell.settings["stage"]
     if not (folder / "config.yaml").exists():
         folder.mkdir(parents=True, exist_ok=True)
         given = folder / "given.yaml"
         given.write_text(cell.config)
         Run.create(load_config(given, [f"run_dir={folder}"])).close()
-    _train_run(folder, stage, report)
+    _train_run(folder, stage, _noting_commit(folder, places, report))
     if stage == "planner":
         curves = {"planner": _curve(folder, "planner")}
         metrics: dict[str, Any] = {"last": curves["planner"][-1]}
@@ -172,7 +215,8 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
         best = json.loads((folder / "summary.json").read_text())["skill"]
         found = driven(open_policies(folder), cell.world or "", settings, report, reward)
         metrics = {"best": {key: value for key, value in best.items() if key != "seconds"}, **found}
-    return Outcome(metrics, {"run": cell.run}, {**cell.settings, **differences(Run.open(folder).config)}, curves)
+    source = {"run": cell.run, "commits": _commits(folder)}
+    return Outcome(metrics, source, {**cell.settings, **differences(Run.open(folder).config)}, curves)
 
 
 def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
@@ -180,14 +224,15 @@ def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
 
     assert cell.world is not None and cell.seed is not None
     wanted = cell.settings
+    folder, (run, _) = places.runs / "table2", training_of(cell, places)
+    tell = _noting_commit(run, places, report)
 
     def show(what: str, done: int, total: int) -> None:
-        report(done / total, f"{what}: {done:,} of {total:,}")
+        tell(done / total, f"{what}: {done:,} of {total:,}")
 
-    folder = places.runs / "table2"
     more = {"world": cell.world, "episodes": wanted["episodes"], "settings": wanted.get("settings", ())}
     found = measure(folder, wanted["samples"], wanted["preset"], cell.seed, **more, on_progress=show)
-    return Outcome(found, {"run": "table2"}, wanted)
+    return Outcome(found, {"run": "table2", "commits": _commits(run)}, wanted)
 
 
 def _walk(cell: Cell, places: Places, report: Report) -> Outcome:

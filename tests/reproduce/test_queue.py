@@ -15,7 +15,7 @@ from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
-from hiernav.reproduce.results import ResultError, git_state, read_result, read_results, result_path
+from hiernav.reproduce.results import ResultError, git_state, read_result, read_results, result_path, write_result
 from hiernav.reproduce.work import Outcome
 
 ROOT = Path(__file__).parents[2]
@@ -116,6 +116,57 @@ def test_a_result_knows_its_commit_and_whether_code_was_changed(places):
     assert git_state(places.root, places.root / "elsewhere") == (git("rev-parse", "HEAD"), False)
     (places.root / "code.py").write_text("2")
     assert git_state(places.root, places.results) == (git("rev-parse", "HEAD"), True)
+
+
+def test_a_result_has_the_commit_at_which_its_cell_started(places):
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(places.root), "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    def commit(name: str) -> str:
+        path = places.root / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(f"{path.read_text() if path.exists() else ''}1")
+        git("add", name)
+        git("commit", "-q", "-m", "x")
+        return git("rev-parse", "HEAD")
+
+    git("init", "-q")
+    commits = [commit("hiernav/code.py")]
+    following = {"a": "docs/text.md", "b": "hiernav/code.py"}
+
+    def work(cell, places, report):
+        if cell.name in following:
+            commits.append(commit(following[cell.name]))
+        return Outcome({"strict": DRIVE}, {})
+
+    Queue([cell("a"), cell("b"), cell("c")], places, work).run()
+    found = [read_result(places.results, f"astar/{name}") for name in "abc"]
+    assert [(each.commit, each.dirty) for each in found] == [
+        (commits[0], False),
+        (commits[1], False),
+        (commits[2], True),  # some of it was loaded before
+    ]
+
+
+def test_a_training_that_went_on_took_what_all_its_processes_took(places):
+    training = cell("t", 2400.0, kind="train", run="t-0", settings={"stage": "skill"}, experiment="planners")
+    (places.runs / "t-0").mkdir(parents=True)
+    line = {"stage": "skill", "step": 520_000, "steps_per_second": 300.0, "seconds": 1700.0}
+    (places.runs / "t-0" / "rates.jsonl").write_text(json.dumps(line) + "\n")
+    other = cell("u", 600.0, kind="train", run="u-0", settings={"stage": "skill"})
+    queue = Queue([training, other], places, Work())
+    queue.run()
+    result = read_result(places.results, "planners/t")
+    assert 1700.0 <= result.seconds < 1760.0
+    assert result_path(places.results, "astar/u").exists()
+
+    def left_after(seconds: float) -> float:
+        write_result(places.results, msgspec.structs.replace(result, seconds=seconds))
+        return Queue([training], places, Work()).estimate(other)
+
+    assert left_after(1800.0) == pytest.approx(600.0 * 1800 / 2400)
+    assert left_after(34.0) == 600.0, "the seconds of its last process say nothing about a training"
 
 
 def test_estimates_follow_what_cells_of_a_kind_took(places):

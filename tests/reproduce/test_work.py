@@ -17,8 +17,8 @@ from hiernav.evaluate import evaluate, open_policies
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed, run_in_process
 from hiernav.reproduce.experiments import SMOKE, catalogue
-from hiernav.reproduce.results import read_result, read_results
-from hiernav.reproduce.work import driven, run_cell
+from hiernav.reproduce.results import git_state, read_result, read_results
+from hiernav.reproduce.work import driven, run_cell, trained_seconds
 from hiernav.sim.layout import parse_world
 
 ROOT = Path(__file__).parents[2]
@@ -73,6 +73,10 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
     outcome = run_cell(cell, places, lambda *_: None)
     assert "going on after step 128 of 384" in capsys.readouterr().out
     assert [point["step"] for point in outcome.curves["evaluation"]] == [128, 256, 384]
+    (commit,) = outcome.source["commits"]  # both processes ran the same code
+    assert commit.removesuffix(" with changes") == str(git_state(ROOT, places.results)[0] or "no repository")
+    first, *_, last = [json.loads(line)["seconds"] for line in (places.runs / cell.run / "rates.jsonl").open()]
+    assert 0.0 < first < last <= trained_seconds(cell, places)
     assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
 
