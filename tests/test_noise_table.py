@@ -5,12 +5,20 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[1] / "tools" / "noise_table.py"
-BUNDLE = str(TOOL.parents[1] / "deploy" / "bundles" / "point")
+from hiernav.nav.bundle import load_bundle
+from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.settings import load_settings
+from hiernav.sim.robots import get_robot
+
+ROOT = Path(__file__).parents[1]
+TOOL = ROOT / "tools" / "noise_table.py"
+BUNDLES = ROOT / "deploy" / "bundles"
+BUNDLE = str(BUNDLES / "point")
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +47,46 @@ def test_the_same_case_gives_the_same_outcome_and_a_slow_planner_another(tool):
     assert outcome(tool.Case(filter=False, noise=4.0)) != outcome(tool.Case(noise=4.0))
 
 
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatch, robot):
+    driven = []
+
+    class Stop(Exception):
+        pass
+
+    def driver(*arguments):
+        driven.extend(arguments)
+        raise Stop
+
+    monkeypatch.setattr(tool, "Driver", driver)
+    with pytest.raises(Stop):
+        tool.drive(tool.Case(), str(BUNDLES / robot), "gremlin", [0], told=True)
+    shipped = load_settings(ROOT / "deploy" / f"{robot}.yaml").guard
+    bundle = load_bundle(BUNDLES / robot)
+    (guard,) = (each for each in driven if isinstance(each, Guard))
+    assert guard.config == replace(shipped, slew_limit=bundle.manifest.guard.slew_limit)
+    assert guard.config != GuardConfig(slew_limit=bundle.manifest.guard.slew_limit)
+
+
+def test_robots_have_results_of_their_own(tool, tmp_path, monkeypatch):
+    files = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tool, "_fill", lambda arguments, *_: files.append(arguments.out))
+    for robot in ("point", "car"):
+        monkeypatch.setattr(sys, "argv", ["noise_table.py", "--bundle", str(BUNDLES / robot)])
+        assert tool.main() == 0
+    assert files == [Path("runs/noise_table-point.json"), Path("runs/noise_table-car.json")]
+
+
 def test_what_was_driven_is_not_driven_again_and_not_mixed_with_another_bundles(tool, tmp_path, monkeypatch, capsys):
     out = tmp_path / "table.json"
     done = {case.name: {"case": {}, "worlds": {"0": {
         "reached": True, "reason": "goal", "fault": None, "steps": 90, "collisions": 0, "holds": 0, "recoveries": 0,
     }}} for case in tool.cases(factorial=False)}  # fmt: skip
     files = tool.load_bundle(BUNDLE).manifest.files
-    about = {"robot": "point", "bundle": files, "world": "pillar(2,2,10)", "told": True}
+    settings = json.loads(json.dumps(asdict(tool.robot_settings(get_robot("point")))))
+    settings.pop("realtime")
+    about = {"robot": "point", "bundle": files, "world": "pillar(2,2,10)", "told": True, "settings": settings}
     out.write_text(json.dumps({"about": about, "cases": done}))
     monkeypatch.setattr(tool, "drive", lambda *_: pytest.fail("driven again"))
     monkeypatch.setattr(sys, "argv", ["noise_table.py", "--out", str(out), "--episodes", "1"])

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Reach rate and collisions of a shipped robot against the quality of its sensors and the delay of its planner.
 
-The whole runtime drives: estimator, guard, supervisor, the learned planner behind a link that answers late as a process
-does, and policies that see the estimate alone. Time is simulated, so that the same command gives the same table.
-"filter off" gives the policies what the sensors say as it is: the last fix, the magnetometer's heading.
+The whole runtime drives, with the settings of deploy/ROBOT.yaml: estimator, guard, supervisor, the learned planner
+behind a link that answers late as a process does, and policies that see the estimate alone. Time is simulated, so that
+the same command gives the same table. "filter off" gives the policies what the sensors say as it is: the last fix, the
+magnetometer's heading.
 
-    python tools/noise_table.py --out runs/noise_table.json                # one influence at a time, 200 worlds each
-    python tools/noise_table.py --out runs/noise_table.json --factorial    # every combination: hours
-    python tools/noise_table.py --out runs/noise_table.json --only-print   # what there is so far
+    python tools/noise_table.py --bundle deploy/bundles/car                # one influence at a time, 200 worlds each
+    python tools/noise_table.py --bundle deploy/bundles/car --factorial    # every combination: hours
+    python tools/noise_table.py --bundle deploy/bundles/car --only-print   # what there is so far
 
 Stop it at any time: the same command goes on. Beside the table stands the noise-free evaluation of the same worlds.
 """
@@ -37,16 +38,17 @@ from hiernav.nav.bundle import Bundle, load_bundle  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap  # noqa: E402
 from hiernav.nav.option import PlanQuery, kept  # noqa: E402
 from hiernav.runtime.clock import FakeClock  # noqa: E402
-from hiernav.runtime.driver import Driver, DriverConfig  # noqa: E402
+from hiernav.runtime.driver import Driver  # noqa: E402
 from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig  # noqa: E402
-from hiernav.runtime.guard import Guard, GuardConfig  # noqa: E402
-from hiernav.runtime.noise import EXACT, SensorNoise  # noqa: E402
+from hiernav.runtime.guard import Guard  # noqa: E402
+from hiernav.runtime.noise import EXACT  # noqa: E402
 from hiernav.runtime.pilot import Answer, Pilot  # noqa: E402
 from hiernav.runtime.policy import load_policies, make_agent, make_planner  # noqa: E402
 from hiernav.runtime.robot import SensorFrame  # noqa: E402
+from hiernav.runtime.settings import Settings, load_settings  # noqa: E402
 from hiernav.runtime.sim_robot import SimRobot  # noqa: E402
 from hiernav.sim.layout import GOAL_RADIUS, parse_world  # noqa: E402
-from hiernav.sim.robots import get_robot  # noqa: E402
+from hiernav.sim.robots import RobotSpec, get_robot  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
 
 CHUNK = 5
@@ -142,12 +144,23 @@ def _bundle(path: str) -> Bundle:
     return load_bundle(path)
 
 
+def robot_settings(spec: RobotSpec) -> Settings:
+    """Those that deploy/run_loop.py drives the robot with."""
+    file = ROOT / "deploy" / f"{spec.name}.yaml"
+    asked = {
+        "estimator": {"tilts": spec.free_base},
+        "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS},
+    }
+    return load_settings(file if file.exists() else None, defaults=asked)
+
+
 def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> dict[str, dict[str, Any]]:
     """Outcome by seed of one case in some worlds."""
     bundle = _bundle(path)
     spec = get_robot(bundle.manifest.robot)
+    settings = robot_settings(spec)
     layouts = [sample_layout(parse_world(world), seed, spec.radius) for seed in seeds]
-    plain = EXACT if case == NOISE_FREE else SensorNoise()
+    plain = EXACT if case == NOISE_FREE else settings.noise
     sigmas = ("accelerometer", "gyro", "magnetometer", "velocimeter", "extra", "fix")
     noise = replace(
         plain,
@@ -155,7 +168,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
         fix_period=1.0 / case.fix_hz,
         fix_latency=1e-3 * case.latency_ms,
     )
-    config = EstimatorConfig(tilts=spec.free_base)
+    config = settings.estimator
     if told and case.noise > 1.0:
         names = ("gyro_sigma", "magnetometer_sigma", "velocimeter_sigma", "fix_sigma")
         config = replace(config, **{name: case.noise * getattr(config, name) for name in names})
@@ -171,8 +184,8 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
         robot.occupancy,
         clock,
         Estimator(config) if case.filter else RawEstimator(config),  # type: ignore[arg-type]
-        Guard(spec.action_dim, GuardConfig(slew_limit=bundle.manifest.guard.slew_limit)),
-        DriverConfig(goal_radius=GOAL_RADIUS, robot_radius=spec.radius, max_steps=layouts[0].spec.max_steps),
+        Guard(spec.action_dim, replace(settings.guard, slew_limit=bundle.manifest.guard.slew_limit)),
+        replace(settings.driver, max_steps=layouts[0].spec.max_steps),
     )
     outcomes = {}
     for layout in layouts:
@@ -207,7 +220,7 @@ def cases(factorial: bool) -> list[Case]:
 def main() -> int:
     """Fill the table as far as it is missing, and print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/noise_table.json"), help="results (%(default)s)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="results (runs/noise_table-ROBOT.json)")
     parser.add_argument("--bundle", type=Path, default=ROOT / "deploy/bundles/point", help="whose robot drives (point)")
     parser.add_argument("--world", default="pillar(2,2,10)", help="kind of world (%(default)s)")
     parser.add_argument("--episodes", type=int, default=200, help="worlds of each row (200)")
@@ -218,11 +231,18 @@ def main() -> int:
     parser.add_argument("--only-print", action="store_true", help="drive nothing")
     arguments = parser.parse_args()
     bundle = load_bundle(arguments.bundle)
+    robot = bundle.manifest.robot
+    arguments.out = arguments.out or Path("runs") / f"noise_table-{robot}.json"
+    settings = asdict(robot_settings(get_robot(robot)))
     about = {
-        "robot": bundle.manifest.robot,
+        "robot": robot,
         "bundle": bundle.manifest.files,
         "world": arguments.world,
         "told": not arguments.untold,
+        # as they are read back from a file
+        "settings": json.loads(
+            json.dumps({name: settings[name] for name in ("driver", "estimator", "guard", "noise")})
+        ),
     }
     results = _read(arguments.out, about)
     rows = cases(arguments.factorial)
