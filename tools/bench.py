@@ -100,4 +100,6 @@ BENCHES: dict[str, Callable[[argparse.Namespace], Any]] = {
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("bench", main))

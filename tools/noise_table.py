@@ -342,4 +342,6 @@ def _print(results: dict[str, Any], rows: list[Case]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("noise_table", main))

@@ -119,4 +119,6 @@ def _plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("planner_scale", main))

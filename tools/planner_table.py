@@ -134,4 +134,6 @@ def _write(file: Path, results: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("planner_table", main))

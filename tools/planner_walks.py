@@ -33,14 +33,15 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
+    worlds = [(world, parse_world(world)) for world in arguments.world or WORLDS]
     policies = open_policies(arguments.run or arguments.bundle)
     radius = expert_planner(policies.config).radius
     rows, touched = [], 0
     print(f"disc of radius {radius} m, {arguments.episodes} episodes a world, seed {arguments.seed}")
     print(f"{'world':>16} {'planner':>13} {'collisions':>10} {'clean':>7} {'reach':>7} {'plans':>6} {'repaired':>9}")
-    for world in arguments.world or WORLDS:
+    for world, spec in worlds:
         for name, (kind, repair) in WALKERS.items():
-            row = evaluate_plans(policies, parse_world(world), kind, repair, arguments.episodes, arguments.seed)
+            row = evaluate_plans(policies, spec, kind, repair, arguments.episodes, arguments.seed)
             rows.append(row)
             verified = name == "verified"
             touched += verified * row["collisions_total"]
@@ -59,4 +60,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("planner_walks", main))
