@@ -50,10 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name is None or error.name.startswith("hiernav"):
             raise
         extra = "ray" if error.name == "ray" else "train"
-        print(
-            f"hiernav {arguments.command}: needs {error.name}: install it with `pip install 'hiernav[{extra}]'`",
-            file=sys.stderr,
-        )
+        how = f"`pip install -e '.[{extra}]'` in the checkout installs it"
+        print(f"hiernav {arguments.command}: needs {error.name}: {how}", file=sys.stderr)
         return BAD_INPUT
 
 

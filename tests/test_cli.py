@@ -343,7 +343,7 @@ sys.exit(main(["train", "run_dir=run"]))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     line = done.stderr.partition("-" * 9 + "\n")[2]
-    assert line == "hiernav train: needs torch: install it with `pip install 'hiernav[train]'`\n"
+    assert line == "hiernav train: needs torch: `pip install -e '.[train]'` in the checkout installs it\n"
     assert list(tmp_path.iterdir()) == []
 
 

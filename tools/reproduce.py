@@ -94,7 +94,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     left = queue.left(arguments.retry_failed)
     if any(cell.kind in TRAINING for cell in left) and find_spec("torchrl") is None:
-        raise ValueError("training needs `pip install 'hiernav[train]'`; --no-training leaves it out")
+        raise ValueError("training needs `pip install -e '.[train]'` in the checkout; --no-training leaves it out")
     bars = Bars(notes, left, queue.estimate)
     with bars.bars:
         tally = queue.run(arguments.budget, arguments.retry_failed, bars)

@@ -82,7 +82,7 @@ class ViewerLink(Observer):
             ValueError: the page does not come up.
         """
         if program is PROGRAM and find_spec("viser") is None:
-            raise ValueError("the live page needs viser: install it with `pip install 'hiernav[view]'`")
+            raise ValueError("the live page needs viser: `pip install -e '.[view]'` in the checkout installs it")
         self.control, self.faults = control, dict(faults or {})
         self.shown = self.dropped = self.refused = 0
         """Ticks shown, messages the page was too slow for, and commands that made no sense or were too many."""

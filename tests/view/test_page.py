@@ -22,7 +22,7 @@ from hiernav.view.commands import Command, Settings
 
 SCRIPT = Path(__file__).parents[2] / "deploy" / "run_loop.py"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="needs viser: pip install 'hiernav[view]'")
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="needs viser: pip install -e '.[view]'")
 WAIT = 300.0
 """A browser that draws in software takes its time on a busy machine [s]."""
 
@@ -31,7 +31,7 @@ WAIT = 300.0
 def browser(tmp_path):
     """Chromium without a screen, driven by selenium."""
     if find_spec("selenium") is None:
-        pytest.skip("needs selenium: pip install 'hiernav[dev]'")
+        pytest.skip("needs selenium: pip install -e '.[dev]'")
     binary = next(filter(None, map(shutil.which, BROWSERS)), None)
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
