@@ -330,7 +330,7 @@ def _watch(arguments: argparse.Namespace) -> int:
     source = Path(arguments.bundle or arguments.run_path or newest_run())
     policies = open_policies(source)
     planner = arguments.planner or ("cnn" if policies.network is not None else "astar")
-    if arguments.planner is None and planner == "astar":
+    if arguments.planner is None and planner == "astar" and not policies.is_baseline:
         print(f"{source} has no planner network yet: the shortest-path planner plans", file=sys.stderr)
     out = arguments.out or (Path("runs/films") if arguments.bundle else source / "films")
     if out.suffix not in SUFFIXES:

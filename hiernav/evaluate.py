@@ -44,6 +44,11 @@ class Policies:
     network: Network | None
     channels: tuple[str, ...] = ()
 
+    @property
+    def is_baseline(self) -> bool:
+        """Whether the skill follows no plan."""
+        return self.config.skill.preset == "baseline"
+
 
 def open_policies(path: str | Path) -> Policies:
     """Policies of a bundle (ONNX Runtime) or of a run folder (torch).
@@ -68,7 +73,7 @@ def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:
 
     A baseline, which follows no plan, gets none, whatever the kind.
     """
-    if policies.config.skill.preset == "baseline":
+    if policies.is_baseline:
         return default_planner(policies.config)
     expert = expert_planner(policies.config)
     if kind == "astar":
@@ -123,7 +128,7 @@ def evaluate(
             "world": name,
             "robot": policies.config.robot,
             "protocol": protocol,
-            "planner": "none" if policies.config.skill.preset == "baseline" else planner,
+            "planner": "none" if policies.is_baseline else planner,
             "seed": seed,
             **summarize(done),
             **_plan_counts(plan),

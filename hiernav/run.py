@@ -200,7 +200,7 @@ def newest_run(folder: str | Path = "runs") -> Path:
     """
     runs = sorted(Path(folder).glob("*/config.yaml"), key=lambda file: file.stat().st_mtime_ns)
     if not runs:
-        raise RunError(f"no run folder in {folder}/: name one with --run, or make one with `hiernav train`")
+        raise RunError(f"no run folder in {folder}/: name another one, or make one with `hiernav train`")
     return runs[-1].parent
 
 

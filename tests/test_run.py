@@ -204,5 +204,5 @@ def test_the_newest_run_is_the_one_begun_last(tmp_path: Path) -> None:
 
 
 def test_where_there_is_no_run_yet_the_error_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="hiernav train"):
+    with pytest.raises(RunError, match="no run folder in .*/: name another one, or make one with `hiernav train`"):
         newest_run(tmp_path)

@@ -97,7 +97,8 @@ def make_film(
             height, width = field_picture(layouts[0], settings.size).pixels.shape[:2]
             views.append(stack.enter_context(closing(MujocoView(task, width, height))))
         writer = stack.enter_context(film_writer(path, settings.frames_per_second(robot.control_period)))
-        camera = _Camera(task, top, views, writer, settings, f"{planner} planner, episode {{}} of {episodes}", on_frame)
+        guide = "no planner" if policies.is_baseline else f"{planner} planner"
+        camera = _Camera(task, top, views, writer, settings, f"{guide}, episode {{}} of {episodes}", on_frame)
 
         def end(number: int, episode: Episode) -> None:
             camera.end(episode)
