@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.config import load_config
+from hiernav.planner import passes
 from hiernav.planner.dataset import data_seed, label_settings
 from hiernav.planner.store import read_manifest, write_dataset
 from hiernav.planner.train import PlannerTrainer, torch_planner
@@ -21,9 +22,6 @@ from hiernav.run import Run
 from hiernav.sim.layout import parse_world
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
-
-BATCH, UPDATES, EPOCHS = 256, 1_000, 6
-"""Every set is seen six times, and small ones until there were 1,000 updates."""
 
 
 def measure(
@@ -65,8 +63,8 @@ def measure(
             f"planner.samples={samples}",
             f"planner.worlds={json.dumps([world])}",
             f"planner.data={data}",
-            f"planner.epochs={max(EPOCHS, -(-UPDATES * BATCH // samples))}",
-            f"planner.batch_size={BATCH}",
+            f"planner.epochs={passes.epochs(samples)}",
+            f"planner.batch_size={passes.BATCH}",
             *settings,
         ],
     )

@@ -16,6 +16,7 @@ import msgspec
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.film.film import film_name
+from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind
 from hiernav.sim.layout import parse_world
 
@@ -86,6 +87,11 @@ BASELINE = ["skill.preset=baseline", "skill.reward_scale=1.0", "reward.time=0"]
 """Its rewards are as large as ours after scaling: every step costs the distance to the goal."""
 
 
+def table2_updates(samples: int) -> int:
+    """Gradient updates that a planner of Table II gets."""
+    return passes.updates(samples)
+
+
 @dataclass(frozen=True)
 class Size:
     """How large everything is."""
@@ -147,7 +153,6 @@ def _table2(size: Size, seeds: int) -> list[Cell]:
     for samples in size.table2_samples:
         for preset in ("paper", "default"):
             for seed in range(seeds):
-                passes = max(6 * samples, 256_000)
                 settings: dict[str, Any] = {"samples": samples, "preset": preset, "episodes": size.episodes}
                 if size.table2_settings:
                     settings["settings"] = list(size.table2_settings)
@@ -161,7 +166,7 @@ def _table2(size: Size, seeds: int) -> list[Cell]:
                         seed=seed,
                         world=size.worlds[0],
                         settings=settings,
-                        seconds=size.share * (60 + samples / 1500 + passes / 1700),
+                        seconds=size.share * (60 + samples / 1500 + passes.epochs(samples) * samples / 1700),
                     )  # fmt: skip
                 )
     return cells

@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 
 from hiernav.nav import goselo  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
+from hiernav.planner import passes, table  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
 from hiernav.planner.dataset import data_seed  # noqa: E402
 from hiernav.planner.store import DatasetError, write_dataset  # noqa: E402
@@ -259,3 +260,15 @@ def test_a_data_set_for_another_robot_or_network_is_refused(tmp_path):
     write_dataset(tmp_path / "data", replace(trainer_in(tmp_path / "run").labels, radius=0.2), 12, (0,))
     with pytest.raises(DatasetError, match=r"made with radius = 0.2, this run plans with 0.1"):
         trainer_in(tmp_path / "other", f"planner.data={tmp_path / 'data'}")
+
+
+def test_a_planner_of_table_2_gets_the_updates_that_are_told_of_it(tmp_path, monkeypatch):
+    planned = []
+
+    def train(trainer, on_progress):
+        planned.append(trainer.schedule.total_steps)
+        trainer.validation = {"error": 0.0}
+
+    monkeypatch.setattr(PlannerTrainer, "train", train)
+    table.measure(tmp_path, 300, "paper", 0, world=tiny_run.WORLD, episodes=1, threads=1)
+    assert planned == [passes.updates(300)] == [1_708]

@@ -101,11 +101,18 @@ def test_the_papers_numbers_are_there_and_belong_where_they_stand(book, page):
     assert [steps["pillar(4,4,40)"][k] for k in (6, 0, 3)] == ["273.7", "76.9", "94.1"]
     assert reach["pillar(2,2,10)"][0] == "–"
     for samples, collisions in paper.TABLE2.items():
-        assert rows(tables.table2(book))[f"{samples:,}"][0] == f"{collisions:.2f}"
+        assert rows(tables.table2(book))[f"{samples:,}"][1] == f"{collisions:.2f}"
     everything = text_of(page)
     for row in paper.TABLE3.values():
         for rate, count in row:
             assert f"{rate:.2f}" in everything and f"{count:.1f}" in everything
+
+
+def test_table_2_tells_the_updates_that_each_size_gets(book):
+    shown = rows(tables.table2(book))
+    assert {samples: row[0] for samples, row in shown.items()} == {
+        "1,000": "1,024", "10,000": "1,040", "50,000": "1,176", "100,000": "2,346"
+    }  # fmt: skip
 
 
 def test_an_interval_over_seeds_is_students():
