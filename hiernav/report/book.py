@@ -21,6 +21,7 @@ _RANGES = {
     **dict.fromkeys(("reach_rate", "collision_free_rate", "spl_mean"), (0.0, 1.0)),
     **dict.fromkeys(("steps_mean", "collisions_mean", "steps_between_plans"), (0.0, math.inf)),
 }
+_ANY = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,13 @@ class Group:
     def estimate(self, name: str, protocol: str = "strict") -> Estimate | None:
         """Of a number of `Drive`: over seeds where there are several, over episodes where there is one; None: not run.
 
-        Intervals: Student's t over seeds; over episodes Wilson for rates, normal for means.
+        Intervals: Student's t over seeds; over episodes Wilson for rates, normal for means; cut to what is possible.
         """
         drives = [drive for result in self.done if (drive := drive_of(result, protocol)) is not None]
         values = [float(value) for drive in drives if (value := getattr(drive, name)) is not None]
         if len(values) == 1:
             return _of_episodes(next(d for d in drives if getattr(d, name) is not None), name)
-        return of_seeds(values, *_RANGES.get(name, (-math.inf, math.inf)))
+        return of_seeds(values, *_RANGES.get(name, _ANY))
 
 
 def of_seeds(values: Sequence[float], least: float = -math.inf, most: float = math.inf) -> Estimate | None:
@@ -132,4 +133,5 @@ def _of_episodes(drive: Drive, name: str) -> Estimate:
     if name == "collision_free_rate":
         return Estimate(value, *wilson_interval(round(value * drive.episodes), drive.episodes))
     half = getattr(drive, _HALF_WIDTHS[name]) if name in _HALF_WIDTHS else None
-    return Estimate(value) if half is None else Estimate(value, value - half, value + half)
+    least, most = _RANGES.get(name, _ANY)
+    return Estimate(value) if half is None else Estimate(value, max(value - half, least), min(value + half, most))

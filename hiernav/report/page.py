@@ -57,7 +57,9 @@ def render(book: Book, beside: Path = Path()) -> str:
         "<h1>The paper, run again</h1>"
         "<p>Ota et al., <i>Efficient Exploration in Constrained Environments with Goal-Oriented Reference Path</i> "
         "(IROS 2020), and hiernav beside it. Ranges are 95 % intervals: over seeds Student’s t, over the episodes of "
-        "one policy Wilson for rates and normal for means.</p>"
+        "one policy Wilson for rates and normal for means, cut to what is possible. A collision of a robot is a "
+        "control step in which it touches an obstacle; there are 50 of them in a second of the point, 25 of the car "
+        "and 10 of the doggo.</p>"
         f"<nav>{links}</nav>{_damaged(book)}{body}</main></body></html>\n"
     )
 
@@ -104,9 +106,9 @@ def _strict(book: Book) -> str:
 def _table2(book: Book) -> str:
     return (
         "<p>Collisions in an episode of a disc that walks along the waypoints, 1000 episodes in pillar(2,2,10), plans "
-        "unverified. <i>Its network, ours</i> is the published network trained here. Every set is seen at least six "
-        "times, and small ones until there were 1,000 updates of 256 samples: the largest set is more data and more "
-        "updates at once. The paper does not tell its own.</p>"
+        "unverified; every waypoint that touches an obstacle counts 1. <i>Its network, ours</i> is the published "
+        "network trained here. Every set is seen at least six times, and small ones until there were 1,000 updates of "
+        "256 samples: the largest set is more data and more updates at once. The paper does not tell its own.</p>"
         + _gallery([(figures.table2(book), "collisions of plans against samples")])
         + tables.table2(book)
         + _command("--only table2")

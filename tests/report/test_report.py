@@ -24,6 +24,7 @@ from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
 from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
 
 FAILED = "sample_efficiency/doggo-ours-1"
 
@@ -122,6 +123,34 @@ def test_an_interval_over_seeds_is_students():
     )
     assert of_seeds([0.9, 1.0], 0.0, 1.0).high == 1.0
     assert of_seeds([]) is None
+
+
+def test_an_interval_over_episodes_is_cut_to_what_is_possible(tmp_path):
+    result = made_up.result_of(made_up.CELLS["table3/car-shipped-gremlin"])
+    few = {
+        "collisions_mean": 8.39,
+        "collisions_half95": 10.2,
+        "spl_mean": 0.99,
+        "spl_half95": 0.02,
+        "return_mean": -3.0,
+    }
+    write_result(
+        tmp_path / "results", msgspec.structs.replace(result, metrics={"strict": result.metrics["strict"] | few})
+    )
+    group = Book.open(tmp_path / "results").group("table3", "shipped", "car", "gremlin")
+    collisions, spl = group.estimate("collisions_mean"), group.estimate("spl_mean")
+    assert (collisions.low, collisions.high) == (0.0, pytest.approx(18.59))
+    assert (spl.low, spl.high) == (pytest.approx(0.97), 1.0)
+    assert tables.cell(group, "collisions_mean").count("-") == 0
+
+
+def test_a_collision_is_defined_by_the_period_of_each_robot(page):
+    told = " ".join(text_of(page).split())
+    rates = {robot: round(1.0 / get_robot(robot).control_period) for robot in ROBOTS}
+    assert (
+        f"A collision of a robot is a control step in which it touches an obstacle; there are {rates['point']} of them "
+        f"in a second of the point, {rates['car']} of the car and {rates['doggo']} of the doggo."
+    ) in told
 
 
 def test_a_failed_seed_is_shown_as_failed_and_its_error_is_text(page):
