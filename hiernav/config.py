@@ -184,7 +184,7 @@ class OptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Annotated[int, Meta(ge=1)] | None,
         Meta(description="Replan every so many steps instead of by rule; null: by rule."),
     ] = None
-    waypoints: Annotated[int, Meta(ge=2, le=100, description="Waypoints of a plan.")] = 10
+    waypoints: Annotated[int, Meta(ge=2, le=100, description="Waypoints of a plan; a skill observes 10.")] = 10
     spacing_m: Annotated[float, Meta(gt=0, le=10, description="Distance between waypoints [m].")] = 0.1
 
 
@@ -336,6 +336,11 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
         raise ConfigError(f"{source}: skill.alpha_fall = {list(skill.alpha_fall)}, expected an earlier share first")
     if skill.overlap and skill.collector == "local":
         raise ConfigError(f"{source}: skill.overlap = true, expected with skill.collector = 'multi' or 'ray' only")
+    if skill.preset != "baseline" and config.option.waypoints != OptionConfig().waypoints:
+        raise ConfigError(
+            f"{source}: option.waypoints = {config.option.waypoints}, expected {OptionConfig().waypoints}: "
+            "that is how many a skill observes"
+        )
     if skill.preset == "baseline" and skill.planner == "cnn":
         raise ConfigError(
             f"{source}: skill.planner = 'cnn', expected 'astar': skill.preset = 'baseline' follows no plan"

@@ -24,6 +24,7 @@ from hiernav.config import (
     dump_config,
     load_config,
 )
+from hiernav.nav.observation import observation_layout
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 SECTIONS = {"planner": PlannerConfig, "skill": SkillConfig, "option": OptionConfig, "reward": RewardConfig}
@@ -245,12 +246,19 @@ def test_an_override_into_a_section_of_a_wrong_type_blames_the_file(tmp_path: Pa
         (["skill.buffer_size=100"], ["skill.batch_size = 256", "skill.buffer_size = 100"]),
         (["skill.total_steps=1000"], ["skill.learning_starts = 2000", "skill.total_steps = 1000"]),
         (["skill.preset=baseline", "reward.preset=default"], ["reward.path_distance", "baseline"]),
+        (["option.waypoints=12"], ["option.waypoints = 12", "expected 10", "observes"]),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(overrides: list[str], parts: list[str]) -> None:
     message = error_of(None, *overrides)
     for part in parts:
         assert part in message
+
+
+def test_a_skill_observes_as_many_waypoints_as_plans_must_have_and_a_baseline_none() -> None:
+    terms = {term.name: term.size for term in observation_layout("point").terms}
+    assert terms["waypoints"] == 2 * OptionConfig().waypoints
+    assert load_config(None, ["skill.preset=baseline", "option.waypoints=12"]).option.waypoints == 12
 
 
 def test_a_configuration_built_in_python_is_checked_too() -> None:
