@@ -15,9 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from hiernav.config import OptionConfig, PlannerConfig, SkillConfig, TrainConfig
+from hiernav.config import OptionConfig, TrainConfig, load_config
 from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
@@ -228,10 +229,14 @@ def _from_bundle(path: Path) -> Policies:
     robot = get_robot(bundle.manifest.robot)
     bundle.require_robot(robot.name, file_sha256(robot.xml_path))
     manifest, terms = bundle.manifest, bundle.layout.names
-    config = TrainConfig(
-        robot=manifest.robot,  # type: ignore[arg-type]  # get_robot has checked it
-        planner=PlannerConfig(
-            preset=manifest.planner.preset,  # type: ignore[arg-type]  # written from a checked configuration
+    skill = "default" if "waypoints" in terms else "baseline"
+    presets = load_config(
+        None, [f"robot={robot.name}", f"planner.preset={manifest.planner.preset}", f"skill.preset={skill}"]
+    )
+    config = msgspec.structs.replace(
+        presets,
+        planner=msgspec.structs.replace(
+            presets.planner,
             hypotheses=manifest.planner.outputs[0].shape[1] or 1,
             planning_radius_m=manifest.plan.planning_radius_m,
             soft_margin_m=manifest.plan.soft_margin_m,
@@ -244,7 +249,7 @@ def _from_bundle(path: Path) -> Policies:
             waypoints=manifest.plan.waypoints,
             spacing_m=manifest.plan.spacing_m,
         ),
-        skill=SkillConfig(preset="default" if "waypoints" in terms else "baseline", clock="clock" in terms),
+        skill=msgspec.structs.replace(presets.skill, clock="clock" in terms),
     )
     bundle.require_layout(skill_layout(config))
     loaded = load_policies(bundle)

@@ -12,7 +12,9 @@ import tiny_run
 torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 
 from hiernav import cli  # noqa: E402
+from hiernav.config import load_config  # noqa: E402
 from hiernav.export import export_run  # noqa: E402
+from hiernav.finetune import fine_tuning_config  # noqa: E402
 from hiernav.nav.bundle import load_bundle  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
 from hiernav.run import Run  # noqa: E402
@@ -47,6 +49,14 @@ def test_the_planner_learns_and_the_skill_stays_what_it_was(
     skill = Run.open(able_run).load("skill")["best_actor"]
     assert all(torch.equal(skill[key], value) for key, value in run.load("skill")["best_actor"].items())
     assert ours.manifest.skill == theirs.manifest.skill
+
+
+def test_the_planner_of_a_bundle_goes_on_learning_by_its_preset(doggo_bundle: Path, able_bundle: Path):
+    paper = fine_tuning_config(doggo_bundle, []).planner
+    assert (paper.preset, paper.hypotheses, paper.mirror) == ("paper", 1, False)
+    assert (paper.clearance_weight, paper.heading_weight, paper.weight_decay) == (0.0, 0.0, 0.0)
+    ours, default = fine_tuning_config(able_bundle, []).planner, load_config().planner
+    assert (ours.preset, ours.mirror, ours.heading_weight) == ("default", default.mirror, default.heading_weight)
 
 
 def test_training_starts_from_the_weights_of_the_source_and_says_how_good_they_are(able_run: Path, tmp_path: Path):
