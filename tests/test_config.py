@@ -108,6 +108,12 @@ def test_a_shipped_file_loads_and_states_only_what_differs_from_the_default(path
             assert any(value != default for value, default in values), line
 
 
+def test_the_baseline_differs_from_the_point_in_its_preset_and_in_having_no_planner() -> None:
+    baseline, point = (CONFIGS[0].with_name(f"{name}.yaml") for name in ("baseline-point", "point"))
+    expected = load_config(point, ["skill.preset=baseline"])
+    assert load_config(baseline) == msgspec.structs.replace(expected, planner=PlannerConfig())
+
+
 def test_exponents_without_a_point_are_numbers(tmp_path: Path) -> None:
     config = load_text(tmp_path, "skill:\n  learning_rate: 3e-4\n  total_steps: 2_000_000\n")
     assert (config.skill.learning_rate, config.skill.total_steps) == (3e-4, 2_000_000)
