@@ -36,7 +36,7 @@ class NavigationGymEnv(gymnasium.Env):
         render_mode: None or "rgb_array", the world from above.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -52,6 +52,7 @@ class NavigationGymEnv(gymnasium.Env):
         self._world = parse_world(world)
         config = msgspec.structs.replace(config or load_config(), robot=robot)
         self.task: NavigationTask = make_task(config, 1, planner, [self._world], layouts=self._draw)
+        self.metadata = self.metadata | {"render_fps": round(1.0 / self.task.robot.control_period)}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.task.layout.size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.task.robot.action_dim,), np.float32)
 

@@ -143,6 +143,13 @@ def test_a_field_that_is_no_square_and_a_lost_robot_can_be_drawn() -> None:
     assert env.render().shape == (240, 480, 3)
 
 
+@pytest.mark.parametrize(("robot", "rate"), [("point", 50), ("car", 25), ("doggo", 10)])
+def test_pictures_of_every_control_step_are_shown_at_the_robot_s_rate(robot: str, rate: int) -> None:
+    env = gymnasium.make(f"hiernav/{robot.capitalize()}Pillar-v0", render_mode="rgb_array")
+    assert env.metadata["render_fps"] == rate
+    assert NavigationGymEnv.metadata["render_modes"] == ["rgb_array"]
+
+
 def test_without_a_render_mode_there_is_no_picture_and_an_unknown_one_is_refused() -> None:
     env = NavigationGymEnv()
     env.reset(seed=0)
