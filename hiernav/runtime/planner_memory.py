@@ -19,7 +19,7 @@ _STATUS = struct.Struct("<qqqqq")
 _SETUP = struct.Struct("<qqqq")  # capacity of a map [pixels], waypoints, bytes of settings, bytes of model
 _MAP = struct.Struct("<QQQdddI")  # version, rows, columns, resolution, origin x and y, CRC-32 of the pixels
 _QUESTION = struct.Struct("<QQ4d")  # number, version of the map, position, goal
-_ANSWER = struct.Struct("<Qd512s")  # number of the question, time it took [s], counts as JSON
+_ANSWER = struct.Struct("<QQd512s")  # number of the question, start of the planner, time it took [s], counts as JSON
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,10 @@ class Reply:
     """(K, 2)"""
     seconds: float
     """That the planner took."""
+    start: int
+    """Of the planner: its first, its second..."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Of a planner that verifies its plans, since its start."""
+    """Of a planner that verifies its plans, since that start."""
 
 
 class PlannerMemory:
@@ -130,16 +132,16 @@ class PlannerMemory:
     def reply(self, reply: Reply) -> None:
         plan = np.ascontiguousarray(reply.plan, np.float64).tobytes()
         counts = json.dumps(reply.counts).encode()
-        self._answers.put(_ANSWER.pack(reply.number, reply.seconds, counts) + plan)
+        self._answers.put(_ANSWER.pack(reply.number, reply.start, reply.seconds, counts) + plan)
 
     def answer(self) -> Reply | None:
         """The newest reply, if it has not been seen before."""
         message = self._answers.get()
         if message is None:
             return None
-        number, seconds, counts = _ANSWER.unpack_from(message)
+        number, start, seconds, counts = _ANSWER.unpack_from(message)
         plan = np.frombuffer(message, np.float64, offset=_ANSWER.size).reshape(-1, 2)
-        return Reply(number, plan, seconds, json.loads(counts.rstrip(b"\0")))
+        return Reply(number, plan, seconds, start, json.loads(counts.rstrip(b"\0")))
 
     def write_map(self, version: int, occupancy: OccupancyMap) -> None:
         """Leave a map for the questions that name its `version`, in the place of the last but one."""

@@ -98,7 +98,8 @@ def make_planner(memory: PlannerMemory) -> Planner:
 
 def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) -> None:
     """Answer the newest question again and again, until the control process closes `questions`."""
-    memory.set_status("ready", memory.status.starts)
+    start = memory.status.starts
+    memory.set_status("ready", start)
     version, occupancy = -1, None
     while wait_for_news(questions, None) is not None:
         question = memory.question()
@@ -119,7 +120,7 @@ def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) ->
         )
         plan = planner.plan(query)[0]
         counts = planner.counts() if isinstance(planner, VerifiedPlanner) else {}
-        memory.reply(Reply(question.number, plan, time.perf_counter() - began, counts))
+        memory.reply(Reply(question.number, plan, time.perf_counter() - began, start, counts))
 
 
 if __name__ == "__main__":

@@ -73,6 +73,7 @@ class ProcessPlanner:
         self._map_version = 0
         self._visits: VisitMap | None = None
         self._silent_since: float | None = None
+        self._newest_start = 0
         self._ended_counts: Counter[str] = Counter()
         self._newest_counts: Counter[str] = Counter()
 
@@ -131,7 +132,7 @@ class ProcessPlanner:
         if reply is not None:
             self._silent_since = None
             self.plan_time.record(reply.seconds)
-            self._count(reply.counts)
+            self._count(reply.start, reply.counts)
             asked = self._asked.get(reply.number)
             wanted = reply.number >= self._wanted_from
             while self._asked and next(iter(self._asked)) <= reply.number:
@@ -158,10 +159,10 @@ class ProcessPlanner:
             self._child.close()
             os.close(self._descriptor)
 
-    def _count(self, counts: Mapping[str, int]) -> None:
-        if counts.get("proposals", 0) < self._newest_counts["proposals"]:  # it has been started again
+    def _count(self, start: int, counts: Mapping[str, int]) -> None:
+        if start != self._newest_start:
             self._ended_counts += self._newest_counts
-        self._newest_counts = Counter(counts)
+        self._newest_start, self._newest_counts = start, Counter(counts)
 
     def _watch(self, now: float) -> None:
         """Have a planner that hangs started again."""

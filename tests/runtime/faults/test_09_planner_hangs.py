@@ -20,6 +20,8 @@ from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.supervisor import Mode
 
 FAR = np.array([1.9, 0.0])
+FREE = empty_map((2.0, 2.0))
+QUERY = PlanQuery(np.zeros((1, 2)), GOAL[None], [FREE], [VisitMap(FREE)], np.full((1, 10, 2), np.nan))
 
 
 def hanging_from(seconds: float, until: float = math.inf) -> tuple[Listener, object, Puck]:
@@ -69,11 +71,9 @@ def planner() -> Iterator[ProcessPlanner]:
 
 def ask(planner: ProcessPlanner, patience: float = 60.0) -> object:
     """Ask until there is an answer, as the loop does."""
-    occupancy = empty_map((2.0, 2.0))
-    query = PlanQuery(np.zeros((1, 2)), GOAL[None], [occupancy], [VisitMap(occupancy)], np.full((1, 10, 2), np.nan))
     end = time.monotonic() + patience
     while time.monotonic() < end and planner.failed is None:
-        planner.plan(query)
+        planner.plan(QUERY)
         time.sleep(0.01)
         answer = planner.answer(time.monotonic())
         if answer is not None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from puck import LAYOUT, Listener, Puck, follow
 from punctual import punctual
 from shipped import open_shipped
-from test_09_planner_hangs import ask
+from test_09_planner_hangs import QUERY, ask
 
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.option import HierarchicalAgent, WaypointOption
@@ -51,7 +52,19 @@ def test_a_killed_planner_is_replaced_and_answers_what_was_asked():
         os.kill(planner.status.pid, signal.SIGKILL)
         np.testing.assert_allclose(ask(planner).plan, first.plan, atol=0.05)
         assert planner.restart_count() == 1 and planner.failed is None
-        assert planner.counts()["proposals"] >= 2, "counted across the restart"
+    finally:
+        planner.close()
+
+
+def test_plans_are_counted_over_all_starts_of_the_planner():
+    planner = ProcessPlanner(open_shipped("point"), 0.1, 6400, hang_after=60.0)
+    try:
+        for start in (1, 2, 3):
+            await_that(lambda start=start: planner.ready and planner.status.starts == start)
+            planner.plan(QUERY)
+            await_that(lambda: planner.answer(time.monotonic()) is not None)
+            assert planner.counts()["proposals"] == start
+            os.kill(planner.status.pid, signal.SIGKILL)
     finally:
         planner.close()
 
@@ -116,10 +129,14 @@ def test_the_loop_misses_no_extra_tick():
 
 
 def wait_for_the_end_of(*processes: int) -> None:
+    await_that(lambda: not any(map(_alive, processes)))
+
+
+def await_that(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 30.0
-    while any(map(_alive, processes)) and time.monotonic() < end:
+    while not (there := condition()) and time.monotonic() < end:
         time.sleep(0.01)
-    assert not any(map(_alive, processes))
+    assert there
 
 
 def _alive(pid: int) -> bool:
