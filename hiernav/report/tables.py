@@ -133,7 +133,7 @@ def replanning(book: Book, robot: str) -> str:
 
 
 def trained_periods(book: Book, robot: str) -> str:
-    """Trainings with fixed periods, driven with A* plans."""
+    """Trainings with fixed periods, driven with A* plans; empty for a robot that is not trained so."""
     kinds = [(robot, f"trained-period-{period}", f"every {period} steps") for period in PERIODS]
     return _trainings(book, "replanning", kinds)
 
@@ -145,7 +145,7 @@ def driving_ablations(book: Book, robot: str) -> str:
 
 
 def trained_ablations(book: Book, robot: str) -> str:
-    """Departures that were trained without."""
+    """Departures that were trained without; empty for a robot that is not trained so."""
     return _trainings(book, "ablations", [(robot, name, WHAT[name]) for name in TRAINING])
 
 
@@ -175,10 +175,10 @@ def _beside_shipped(
 
 def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]]) -> str:
     names = ("reach_rate", "steps_mean", "collisions_mean")
-    rows: list[list[str]] = []
-    for robot, variant, label in kinds:
-        if not book.knows(experiment, variant, robot):
-            continue
+    known, rows = [kind for kind in kinds if book.knows(experiment, kind[1], kind[0])], list[list[str]]()
+    if not known:
+        return ""
+    for robot, variant, label in known:
         group = book.group(experiment, variant, robot)
         if experiment != "sample_efficiency" and not rows:
             ours = book.group("sample_efficiency", "ours", robot)

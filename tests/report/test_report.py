@@ -15,15 +15,17 @@ import numpy as np
 import pytest
 
 from hiernav import cli
+from hiernav.config import load_config
 from hiernav.film.film import film_name
 from hiernav.report import findings as told
 from hiernav.report import paper, tables
 from hiernav.report.book import Book, of_seeds
-from hiernav.report.page import FILM_LIMIT, _film, render, write_report
+from hiernav.report.page import FILM_LIMIT, _ablations, _film, _replanning, render, write_report
 from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
 from hiernav.sim.layout import parse_world
+from hiernav.sim.reward import TERMS
 from hiernav.sim.robots import get_robot
 
 FAILED = "sample_efficiency/doggo-ours-1"
@@ -244,20 +246,47 @@ def test_a_damaged_result_is_named_on_the_page_and_by_the_command(results, tmp_p
     assert cli.main(["report", "--results", str(tmp_path / "nothing"), "--out", str(out)]) == 2
 
 
-def test_results_of_another_bundle_are_marked(tmp_path):
-    for name in ("configs", "deploy/bundles/point"):  # as much of the repository as it asks for
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """As much of the repository as the page asks for, without results."""
+    for name in ("configs", "deploy/bundles/point"):
         (tmp_path / name).mkdir(parents=True)
         for file in (made_up.ROOT / name).iterdir():
             if file.is_file():
                 (tmp_path / name / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "results").mkdir()
+    return tmp_path
+
+
+def test_results_of_another_bundle_are_marked(repository):
     cells = [c for c in made_up.CELLS.values() if c.kind == "evaluate" and c.seed is None][:2]
-    places = Places(made_up.ROOT, tmp_path, tmp_path)
-    write_result(tmp_path / "results", made_up.result_of(cells[0], key=cell_key(cells[0], places)))
-    write_result(tmp_path / "results", made_up.result_of(cells[1]))
-    book = Book.open(tmp_path / "results")
+    places = Places(made_up.ROOT, repository, repository)
+    write_result(repository / "results", made_up.result_of(cells[0], key=cell_key(cells[0], places)))
+    write_result(repository / "results", made_up.result_of(cells[1]))
+    book = Book.open(repository / "results")
     assert book.changed == {cells[1].id}
     assert book.knows("ablations", "no-clock", "doggo") and not book.knows("ablations", "no-clock", "point")
     assert cells[1].id in render(book) and "makes them again" in render(book)
+
+
+def test_what_no_experiment_holds_is_not_called_missing_and_who_is_trained_is_named(repository):
+    book = Book.open(repository / "results")
+    periods, ablations = _replanning(book).partition("Trained with")[2], _ablations(book).partition("In training")[2]
+    assert "car: " in text_of(periods) and not re.search("(point|doggo): ", text_of(periods))
+    assert not re.search("point: ", text_of(ablations))
+    assert "The car is trained so; the paper trained the doggo." in text_of(periods)
+    assert "The car is trained so, and in the place of it the doggo for: no cost of tilting;" in text_of(ablations)
+    for named, cells in (("replanning", {"car"}), ("ablations", {"car", "doggo"})):
+        trained = [c.robot for c in made_up.CELLS.values() if c.experiment == named and c.kind == "train"]
+        assert set(trained) == cells
+
+
+def test_what_the_baselines_reward_adds_to_the_papers_is_said(page):
+    reward = load_config(None, ["skill.preset=baseline"]).reward
+    assert {"leave_field", "tilt", "fall"} == {
+        name for name in TERMS if getattr(reward, name) and name not in ("collision", "goal", "goal_distance")
+    }
+    assert "terms that the paper’s lacks: leaving the field, tilting and falling cost as well" in text_of(page)
 
 
 def with_reach(rate: float, steps: float = 30.0):
