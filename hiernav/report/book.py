@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hiernav.evaluate import wilson_interval
-from hiernav.reproduce.cells import Cell, Places, cell_key
+from hiernav.reproduce.cells import Cell, Places, bundle_hashes, cell_key
 from hiernav.reproduce.experiments import catalogue
 from hiernav.reproduce.results import Drive, Result, drive_of, read_results
 
@@ -41,6 +41,14 @@ class Group:
 
     done: tuple[Result, ...] = ()
     failed: tuple[Result, ...] = ()
+    older: tuple[str, ...] = ()
+    """What is no longer that of the repository (`Book.changed`), of each result of which something is."""
+
+    @property
+    def age(self) -> str:
+        """ "older bundle", "1 of 3: older settings", or nothing where all results are of what the repository holds."""
+        count, what = len(self.done) + len(self.failed), " and ".join(sorted(set(self.older)))
+        return what if len(self.older) in (0, count) else f"{len(self.older)} of {count}: {what}"
 
     def estimate(self, name: str, protocol: str = "strict") -> Estimate | None:
         """Of a number of `Drive`: over seeds where there are several, over episodes where there is one; None: not run.
@@ -75,10 +83,12 @@ class Book:
     results: list[Result]
     damaged: list[str]
     """A line for each file that cannot be used."""
-    changed: set[str] = field(default_factory=set)
-    """Results whose settings or bundle are no longer those of the repository."""
+    changed: dict[str, str] = field(default_factory=dict)
+    """Results whose settings or bundle are no longer those of the repository: "older settings" or "older bundle"."""
     cells: list[Cell] = field(default_factory=list)
     """All that there is to run; empty away from the repository."""
+    left_out: int = 0
+    """Results that `current` has left out."""
 
     @classmethod
     def open(cls, folder: Path) -> Book:
@@ -92,23 +102,37 @@ class Book:
             # more seeds than usual, so that all that were trained are known
             most = max((result.seed + 1 for result in results if result.seed is not None), default=1)
             keys = {cell.id: cell_key(cell, places) for cell in catalogue(root, seeds=max(5, most))}
-            book.changed = {r.id for r in results if keys.get(r.id) != r.key}
+            book.changed = {r.id: _what_changed(r, root) for r in results if keys.get(r.id) != r.key}
             book.cells = catalogue(root)
         return book
 
-    def group(self, experiment: str, variant: str, robot: str | None = None, world: str | None = None) -> Group:
-        """Results of a variant, by seed."""
+    def current(self) -> Book:
+        """The same without results of older settings or bundles, for whoever draws conclusions."""
+        kept = [result for result in self.results if result.id not in self.changed]
+        return replace(self, results=kept, changed={}, left_out=len(self.results) - len(kept))
+
+    def group(
+        self,
+        experiment: str,
+        variant: str,
+        robot: str | None = None,
+        world: str | None = None,
+        samples: int | None = None,
+    ) -> Group:
+        """Results of a variant, by seed; of a size of Table II if there are `samples`."""
         found = [
             result
             for result in self.results
             if (result.experiment, result.variant) == (experiment, variant)
             and robot in (None, result.robot)
             and world in (None, result.world)
+            and samples in (None, result.settings.get("samples"))
         ]
         found.sort(key=lambda result: -1 if result.seed is None else result.seed)
         return Group(
             tuple(result for result in found if result.state == "done"),
             tuple(result for result in found if result.state == "failed"),
+            tuple(self.changed[result.id] for result in found if result.id in self.changed),
         )
 
     def knows(self, experiment: str, variant: str, robot: str) -> bool:
@@ -117,6 +141,12 @@ class Book:
         return not self.cells or any(
             (entry.experiment, entry.variant, entry.robot) == (experiment, variant, robot) for entry in entries
         )
+
+
+def _what_changed(result: Result, root: Path) -> str:
+    bundle = result.source.get("bundle")
+    same = bundle is None or result.source.get("sha256") == bundle_hashes(root / bundle)
+    return "older settings" if same else "older bundle"
 
 
 def curve(result: Result, name: str, stage: str = "evaluation") -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,8 @@ class Finding:
 
 
 def findings(book: Book) -> list[Finding]:
-    """All targets, in the order of the page."""
+    """All targets, in the order of the page, judged by what is of the settings and bundles of the repository."""
+    book = book.current()
     return [
         _paper_table3(book),
         *(_strict(book, robot) for robot in ROBOTS),
@@ -40,7 +41,7 @@ def findings(book: Book) -> list[Finding]:
 
 def shortfalls(book: Book, robot: str) -> list[str]:
     """A sentence for each world in which the shipped robot misses the strict target: how, and what A* says of why."""
-    sentences = []
+    book, sentences = book.current(), list[str]()
     for world in WORLDS:
         for result in book.group("table3", "shipped", robot, world).done:
             drive = drive_of(result)
@@ -63,7 +64,7 @@ _ENDINGS = {
 def _blame(book: Book, robot: str, world: str, interval: tuple[float, float]) -> str:
     other = book.group("astar", "astar", robot, world).estimate("reach_rate")
     if other is None:
-        return "Whether the plans or the skill are the cause is not known: A* as planner was not run yet."
+        return "Whether the plans or the skill are the cause is not known: A* as planner was not run with this bundle."
     low, high = interval
     if other.low > high:
         return f"With A* plans it reaches {other.mean:.3f}: part of the cause is the learned planner."
@@ -95,7 +96,7 @@ def _paper_table3(book: Book) -> Finding:
         met += not short
         if short:
             missed.append(f"{world} ({', '.join(short)})")
-    return _verdict(target, met, missed, missing, "worlds")
+    return _verdict(book, target, met, missed, missing, "worlds")
 
 
 def _strict(book: Book, robot: str) -> Finding:
@@ -111,7 +112,7 @@ def _strict(book: Book, robot: str) -> Finding:
             met += 1
         else:
             missed.append(f"{world} ({estimate.mean:.3f})")
-    return _verdict(target, met, missed, missing, "worlds")
+    return _verdict(book, target, met, missed, missing, "worlds")
 
 
 def _doggo_steps(book: Book) -> Finding:
@@ -125,7 +126,7 @@ def _doggo_steps(book: Book) -> Finding:
             met += 1
         else:
             missed.append(f"seed {result.seed} ({'never' if first is None else f'{first:,.0f} steps'})")
-    return _verdict(target, met, missed, [] if group.done or group.failed else ["no seed"], "seeds")
+    return _verdict(book, target, met, missed, [] if group.done or group.failed else ["no seed"], "seeds")
 
 
 def _above_baseline(book: Book, robot: str) -> Finding:
@@ -139,22 +140,21 @@ def _above_baseline(book: Book, robot: str) -> Finding:
             met += 1
         else:
             missed.append(f"seed {seed} ({a.reach_rate:.3f} against {b.reach_rate:.3f})")
-    return _verdict(target, met, missed, [] if met or missed else ["no pair of seeds"], "seeds")
+    return _verdict(book, target, met, missed, [] if met or missed else ["no pair of seeds"], "seeds")
 
 
 def _table2(book: Book) -> Finding:
     target = "Fewer collisions of plans than in Table II, for every number of samples (our network)"
     missed, met, missing = [], 0, []
     for samples, printed in paper.TABLE2.items():
-        found = book.group("table2", "default").done
-        values = [r.metrics["collisions_mean"] for r in found if r.metrics["samples"] == samples]
+        values = [r.metrics["collisions_mean"] for r in book.group("table2", "default", samples=samples).done]
         if not values:
             missing.append(f"{samples:,}")
         elif np.mean(values) <= printed:
             met += 1
         else:
             missed.append(f"{samples:,} ({np.mean(values):.2f} against {printed:.2f})")
-    return _verdict(target, met, missed, missing, "sizes")
+    return _verdict(book, target, met, missed, missing, "sizes")
 
 
 def steps_to(result: Result, rate: float) -> float | None:
@@ -168,13 +168,14 @@ def _by_seed(group: Group) -> dict[int, Result]:
     return {result.seed: result for result in group.done if result.seed is not None}
 
 
-def _verdict(target: str, met: int, missed: Sequence[str], missing: Sequence[str], what: str) -> Finding:
+def _verdict(book: Book, target: str, met: int, missed: Sequence[str], missing: Sequence[str], what: str) -> Finding:
     total = met + len(missed) + len(missing)
     parts = []
     if missed:
         parts.append(f"missed: {', '.join(missed)}")
     if missing:
-        parts.append(f"not run yet: {', '.join(missing)}")
+        how = ", or with older settings or an older bundle alone" if book.left_out else ""
+        parts.append(f"not run yet{how}: {', '.join(missing)}")
     if met:
         parts.insert(0, f"met for {met} of {total} {what}")
     state = False if missed else None if missing else True

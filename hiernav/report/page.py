@@ -60,7 +60,7 @@ def render(book: Book, beside: Path = Path()) -> str:
         "one policy Wilson for rates and normal for means, cut to what is possible. A collision of a robot is a "
         "control step in which it touches an obstacle; there are 50 of them in a second of the point, 25 of the car "
         "and 10 of the doggo.</p>"
-        f"<nav>{links}</nav>{_damaged(book)}{body}</main></body></html>\n"
+        f"<nav>{links}</nav>{_damaged(book)}{_older(book)}{body}</main></body></html>\n"
     )
 
 
@@ -187,6 +187,7 @@ def _films(book: Book, beside: Path) -> str:
             for result in group.done:
                 count, reached = result.settings.get("episodes"), result.metrics.get("reached")
                 caption = f"{robot}, {world}: {reached} of {count} reached the goal"
+                caption += f" ({group.age})" if group.age else ""
                 shown.append((_film(book.folder / "films" / result.metrics["file"], beside), caption))
             shown += [
                 (f'<p class="short">failed: {escape(r.error or "")}</p>', f"{robot}, {world}") for r in group.failed
@@ -255,7 +256,7 @@ def _provenance(book: Book) -> str:
         *(f"<p><small>{escape(text)}</small></p>" for text in versions),
     ]
     if book.changed:
-        items = "".join(f"<li>{escape(name)}</li>" for name in sorted(book.changed))
+        items = "".join(f"<li>{escape(name)}: {what}</li>" for name, what in sorted(book.changed.items()))
         parts.append(f"<p>Of other settings or another bundle than the repository now holds; the queue makes them "
                      f"again:</p><ul>{items}</ul>")  # fmt: skip
     if failed:
@@ -269,6 +270,15 @@ def _damaged(book: Book) -> str:
         return ""
     items = "".join(f"<li>{escape(line)}</li>" for line in book.damaged)
     return f'<p class="short">Result files that cannot be used:</p><ul>{items}</ul>'
+
+
+def _older(book: Book) -> str:
+    if not book.changed:
+        return ""
+    return (
+        f"<p>{len(book.changed)} of {len(book.results)} results are of older settings or an older bundle than the "
+        "repository now holds. Their cells say so, no text concludes from them, and figures show them as they are.</p>"
+    )
 
 
 def _by_robot(make: Callable[[str], str]) -> str:

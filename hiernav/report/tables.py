@@ -92,10 +92,9 @@ def table2(book: Book) -> str:
     for samples, printed in paper.TABLE2.items():
         row = [f"{samples:,}", f"{table2_updates(samples):,}", f'<span class="theirs">{printed:.2f}</span>']
         for preset in ("paper", "default"):
-            group = book.group("table2", preset)
-            values = [r.metrics["collisions_mean"] for r in group.done if r.metrics["samples"] == samples]
-            failed = [r for r in group.failed if r.settings.get("samples") == samples]
-            row.append(_shown(of_seeds(values, 0.0), "collisions_mean", len(failed), printed, fewer=True))
+            group = book.group("table2", preset, samples=samples)
+            estimate = of_seeds([result.metrics["collisions_mean"] for result in group.done], 0.0)
+            row.append(_shown(estimate, "collisions_mean", group, printed, fewer=True))
         rows.append(row)
     return table(["our updates", "the paper", "its network, ours", "our network"], rows, "samples")
 
@@ -104,9 +103,10 @@ def walks(book: Book, robot: str) -> str:
     """Plans alone: collisions and reach rate of a disc, whoever plans."""
     rows = []
     for world in (*WORLDS, *UNSEEN):
-        for result in book.group("walks", "shipped", robot, world).done:
-            found = result.metrics
-            row = [f"{escape(world)}{'' if world in WORLDS else ' <small>unseen</small>'}"]
+        group = book.group("walks", "shipped", robot, world)
+        for result in group.done:
+            found, notes = result.metrics, ["" if world in WORLDS else "unseen", group.age]
+            row = [" ".join([escape(world), *(f"<small>{note}</small>" for note in notes if note)])]
             row += [f"{found[name]['collisions_mean']:.3f}" for name in ("network", "verified")]
             row += [f"{found[name]['reach_rate']:.3f}" for name in ("network", "verified", "astar")]
             rows.append([*row, f"{100.0 * found['verified']['repairs'] / found['verified']['proposals']:.1f} %"])
@@ -188,8 +188,8 @@ def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]
 
 
 def cell(group: Group, name: str, protocol: str = "strict", bar: float | None = None) -> str:
-    """A number with its interval, failed seeds named; marked if there is a bar to reach."""
-    return _shown(group.estimate(name, protocol), name, len(group.failed), bar, fewer=name != "reach_rate")
+    """A number with its interval, failed seeds and older bundles named; marked if there is a bar to reach."""
+    return _shown(group.estimate(name, protocol), name, group, bar, fewer=name != "reach_rate")
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], first: str) -> str:
@@ -205,11 +205,11 @@ def _cells(texts: Sequence[str]) -> str:
     return "".join(f"<td>{text}</td>" for text in texts)
 
 
-def _shown(estimate: Estimate | None, name: str, failed: int, bar: float | None, fewer: bool) -> str:
+def _shown(estimate: Estimate | None, name: str, group: Group, bar: float | None, fewer: bool) -> str:
     parts = []
     if estimate is not None:
         mark = ""
-        if bar is not None:
+        if bar is not None and not group.age:
             met = estimate.mean <= bar if fewer else estimate.mean >= bar
             mark = ' class="met"' if met else ' class="short"'
         parts.append(f"<span{mark}>{_number(estimate.mean, name)}</span>")
@@ -217,8 +217,10 @@ def _shown(estimate: Estimate | None, name: str, failed: int, bar: float | None,
             parts.append(f"<small>{_number(estimate.low, name)} – {_number(estimate.high, name)}</small>")
         if estimate.count > 1:
             parts.append(f"<small>{estimate.count} seeds</small>")
-    if failed:
-        parts.append(f'<span class="short">{failed} failed</span>')
+    if group.failed:
+        parts.append(f'<span class="short">{len(group.failed)} failed</span>')
+    if group.age:
+        parts.append(f"<small>{group.age}</small>")
     return "<br>".join(parts) or NOT_RUN
 
 

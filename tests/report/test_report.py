@@ -6,6 +6,7 @@ import base64
 import html
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -264,9 +265,53 @@ def test_results_of_another_bundle_are_marked(repository):
     write_result(repository / "results", made_up.result_of(cells[0], key=cell_key(cells[0], places)))
     write_result(repository / "results", made_up.result_of(cells[1]))
     book = Book.open(repository / "results")
-    assert book.changed == {cells[1].id}
+    assert book.changed == {cells[1].id: "older settings"}
     assert book.knows("ablations", "no-clock", "doggo") and not book.knows("ablations", "no-clock", "point")
     assert cells[1].id in render(book) and "makes them again" in render(book)
+
+
+def test_results_of_an_older_bundle_say_so_in_their_cells_and_nothing_is_concluded_from_them(repository):
+    places = Places(made_up.ROOT, repository, repository)
+    now, older, plans = (
+        made_up.CELLS[name]
+        for name in ("table3/point-shipped-two-room", "table3/point-shipped-gremlin", "astar/point-astar-two-room")
+    )
+    failing = made_up.drive(np.random.default_rng(0), 1000) | {
+        "reach_rate": 0.5, "reach_ci95": [0.47, 0.53], "endings": {"goal": 500, "fallen": 300, "timeout": 200},
+    }  # fmt: skip
+    before = {"bundle": now.bundle, "sha256": {}}
+    for cell, changes in (
+        (now, {"key": cell_key(now, places)}),
+        (older, {"source": before}),
+        (plans, {"source": before}),
+    ):
+        metrics = {"strict": failing | ({"reach_rate": 1.0, "reach_ci95": [0.99, 1.0]} if cell is plans else {})}
+        write_result(repository / "results", made_up.result_of(cell, metrics=metrics, **changes))
+    book = Book.open(repository / "results")
+    assert book.changed == {older.id: "older bundle", plans.id: "older bundle"}
+    shown = rows(tables.strict(book, "point"))
+    assert all(text.endswith("older bundle") for text in shown["gremlin  ours, shipped bundle"])
+    assert not any("older" in text for text in shown["two-room  ours, shipped bundle"])
+    groups = [book.group("table3", "shipped", "point", world) for world in ("two-room", "gremlin")]
+    assert ['class="met"' in tables.cell(group, "reach_rate", bar=0.4) for group in groups] == [True, False]
+    assert told.shortfalls(book, "point") == [
+        "two-room: 500 of 1000 episodes fail, 300 by lying on its back at the cap on steps, 200 by reaching the cap on "
+        "steps. Whether the plans or the skill are the cause is not known: A* as planner was not run with this bundle."
+    ]
+    strict = next(f for f in told.findings(book) if "point, shipped" in f.target)
+    assert strict.text.startswith(
+        "missed: two-room (0.500); not run yet, or with older settings or an older bundle alone:"
+    )
+    assert "gremlin" in strict.text.partition("alone:")[2]
+    assert "2 of 3 results are of older settings or an older bundle" in text_of(render(book))
+
+
+def test_seeds_of_older_settings_are_counted_among_the_others(book):
+    ids = [f"table3/doggo-ours-{seed}-gremlin" for seed in range(3)]
+    mixed = replace(book, changed={ids[0]: "older settings"})
+    assert mixed.group("table3", "ours", "doggo", "gremlin").age == "1 of 3: older settings"
+    assert book.group("table3", "ours", "doggo", "gremlin").age == ""
+    assert len(mixed.current().group("table3", "ours", "doggo", "gremlin").done) == 2
 
 
 def test_what_no_experiment_holds_is_not_called_missing_and_who_is_trained_is_named(repository):
@@ -325,7 +370,7 @@ def test_targets_are_judged_by_the_numbers(tmp_path, rate, met):
         assert "gremlin (reach rate 0.900 against 1.00)" in first.text and "gremlin (0.900)" in strict.text
         assert short[0] == (
             "pillar(2,2,10): 100 of 1000 episodes fail, 100 by reaching the cap on steps. "
-            "Whether the plans or the skill are the cause is not known: A* as planner was not run yet."
+            "Whether the plans or the skill are the cause is not known: A* as planner was not run with this bundle."
         )
 
 
