@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -134,6 +136,16 @@ class Book:
             tuple(result for result in found if result.state == "failed"),
             tuple(self.changed[result.id] for result in found if result.id in self.changed),
         )
+
+    def training_worlds(self, robot: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+        """Worlds that planner and skill of ours are trained in, weights left out; None if nothing tells."""
+        for cell in self.cells:
+            if (cell.experiment, cell.variant, cell.robot) == ("sample_efficiency", "ours", robot) and cell.config:
+                config = json.loads(cell.config)
+                planner, skill = (config[part]["worlds"] for part in ("planner", "skill"))
+                plain = dict.fromkeys(re.sub(r"^[\d.]+\s*\*\s*", "", world) for world in planner)
+                return tuple(plain), tuple(dict.fromkeys(skill))
+        return None
 
     def knows(self, experiment: str, variant: str, robot: str) -> bool:
         """Whether there is such a thing to run, as far as is known: a departure may change nothing for a robot."""

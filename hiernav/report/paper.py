@@ -17,6 +17,8 @@ TABLE3 = {
 }
 """Table III: world -> reach rate and steps to the goal of each variant; of `TABLE3_ROBOT`, 200 episodes."""
 
+TRAINING_WORLD = "pillar(2,2,10)"
+"""The one that planner and skill of Table III are trained in; a fine-tuned planner also in the world of its row."""
 STEPS_BETWEEN_PLANS = 8.5
 """Mean, of the rule; figure "Training curves comparison among different frequencies", the doggo."""
 TRAINING_STEPS = 3_000_000

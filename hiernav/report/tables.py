@@ -47,6 +47,16 @@ WHAT = {
 """Ablation -> what differs."""
 
 
+def training_worlds(book: Book) -> str:
+    """Worlds that the networks of Table III were trained in, the paper's and ours."""
+    rows = [["the paper, doggo", *[f'<span class="theirs">{escape(paper.TRAINING_WORLD)}</span>'] * 2]]
+    for robot in reversed(ROBOTS):
+        worlds = book.training_worlds(robot)
+        if worlds is not None:
+            rows.append([f"ours, {robot}", *("<br>".join(map(escape, each)) for each in worlds)])
+    return table(["planner", "skill, and the baseline"], rows, "trained in")
+
+
 def table3(book: Book, robot: str, name: str) -> str:
     """The paper's Table III and ours, under the paper's protocol."""
     columns = [  # ours first: a narrow screen shows few

@@ -23,7 +23,7 @@ from hiernav.report import paper, tables
 from hiernav.report.book import Book, of_seeds
 from hiernav.report.page import FILM_LIMIT, _ablations, _film, _replanning, render, write_report
 from hiernav.reproduce.cells import Places, cell_key
-from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, WORLDS
+from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, UNSEEN, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
 from hiernav.sim.layout import parse_world
 from hiernav.sim.reward import TERMS
@@ -312,6 +312,22 @@ def test_seeds_of_older_settings_are_counted_among_the_others(book):
     assert mixed.group("table3", "ours", "doggo", "gremlin").age == "1 of 3: older settings"
     assert book.group("table3", "ours", "doggo", "gremlin").age == ""
     assert len(mixed.current().group("table3", "ours", "doggo", "gremlin").done) == 2
+
+
+def test_the_worlds_that_all_columns_were_trained_in_are_told_and_unseen_ones_are_none_of_them(repository):
+    book = Book.open(repository / "results")
+    shown = rows(tables.training_worlds(book))
+    assert shown["the paper, doggo"] == ["pillar(2,2,10)", "pillar(2,2,10)"]
+    for robot in ROBOTS:
+        config = load_config(made_up.ROOT / "configs" / f"{robot}.yaml")
+        planner, skill = (row.split() for row in shown[f"ours, {robot}"])
+        assert len(planner) == len(config.planner.worlds) and all(map(str.endswith, config.planner.worlds, planner))
+        assert set(skill) == set(config.skill.worlds)
+        assert set(WORLDS) <= set(planner) and not set(UNSEEN) & {*planner, *skill}
+    told = " ".join(text_of(render(book)).split())
+    assert "networks, its baseline too, were trained in pillar(2,2,10) alone" in told
+    assert "How ours do in worlds that neither were trained in is under unseen worlds" in told
+    assert tables.training_worlds(book) in render(book)
 
 
 def test_what_no_experiment_holds_is_not_called_missing_and_who_is_trained_is_named(repository):
