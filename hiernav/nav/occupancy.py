@@ -112,6 +112,9 @@ class OccupancyMap:
     def _padded_clearance(self) -> NDArray[np.float32]:
         free = np.pad(~self.occupied, 1).view(np.uint8)
         pixels = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        # squares of these are whole numbers, but for a rounding that differs from call to call
+        np.multiply(pixels, pixels, out=pixels)
+        np.sqrt(np.rint(pixels, out=pixels), out=pixels)
         return np.maximum(pixels - np.float32(0.5), np.float32(0.0)) * np.float32(self.resolution)
 
 

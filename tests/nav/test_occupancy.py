@@ -184,3 +184,16 @@ def test_visits_are_found_within_a_square_around_a_position() -> None:
     assert not visits.near((-0.525, 0.025), 0.3)
     assert visits.near((1.3, 0.0), 0.9), "a position outside the map, its square reaching in"
     assert not visits.near((-3.0, -3.0), 0.5)
+
+
+def test_clearances_are_the_same_to_the_bit_whenever_they_are_computed() -> None:
+    occupied = np.random.default_rng(0).random((60, 50)) < 0.01
+    row, col = np.indices(occupied.shape)
+    near = np.argwhere(occupied).T[:, :, None, None]
+    squares = ((row - near[0]) ** 2 + (col - near[1]) ** 2).min(axis=0).astype(np.float32)
+    expected = np.maximum(np.sqrt(squares) - np.float32(0.5), np.float32(0.0)) * np.float32(0.05)
+    # nearer to an obstacle than to the border
+    inside = (np.minimum.reduce([row, col, 59 - row, 49 - col]) >= 8) & (squares < 64)
+    for _ in range(3):
+        clearance = OccupancyMap(occupied.copy(), 0.05, (0.0, 0.0)).clearance
+        np.testing.assert_array_equal(clearance[inside], expected[inside])
