@@ -21,7 +21,7 @@ SKILL = {
     *(f"replans/{reason.name.lower()}" for reason in TerminationReason if reason),
 }  # fmt: skip
 PLANNER = {"loss", "error", "blocked_waypoints", "walk_collisions", "walk_reach_rate"}
-EVALUATION = {"reach_rate", "steps_mean", "collisions_mean", "return_mean"}
+EVALUATION = {"reach_rate", "steps_mean", "collisions_mean", "merit_std", "return_mean"}
 RATES = {
     "skill/steps_per_second", "skill/updates_per_second", "planner/samples_per_second", "skill/seconds",
     "planner/seconds",

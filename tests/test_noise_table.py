@@ -42,7 +42,7 @@ def test_the_same_case_gives_the_same_outcome_and_a_slow_planner_another(tool):
         return tool.drive(case, BUNDLE, "pillar(2,2,10)", [3], told=True)["3"]
 
     assert outcome(tool.Case()) == outcome(tool.Case())
-    assert outcome(tool.NOISE_FREE)["reached"]
+    assert outcome(tool.NOISE_FREE)["reached"] and outcome(tool.Case(filter=False))["reached"]
     assert outcome(tool.Case(planner_ms=300))["steps"] != outcome(tool.Case())["steps"]
     assert outcome(tool.Case(filter=False, noise=4.0)) != outcome(tool.Case(noise=4.0))
 

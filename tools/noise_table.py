@@ -88,6 +88,10 @@ class RawEstimator:
     def reset(self) -> None:
         self._fix: np.ndarray | None = None
 
+    def silence(self, sensor: str) -> float:
+        """As of `Estimator`; here nothing is given where a sensor says nothing."""
+        return 0.0
+
     def update(self, frame: SensorFrame) -> Estimate | None:
         if frame.position_fix is not None:
             self._fix = frame.position_fix

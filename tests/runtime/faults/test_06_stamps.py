@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from puck import GOAL, Listener, Puck, Scripted, driver_of, pilot_for
+from puck import GOAL, Listener, Puck, Scripted, driver_of, map_with, pilot_for
 from runtime_motion import estimator_for, frames, recorded
 
 from hiernav.nav.planners import StraightPlanner
 from hiernav.runtime.estimator import Estimate, Trust
+from hiernav.runtime.pilot import Decision
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
 
@@ -164,8 +165,19 @@ def test_a_plan_from_before_the_clock_started_again_is_not_followed():
     seen, robot = Listener(), Puck(control_period=0.02, noise=1e-3, sees=sees)
     pilot = pilot_for(StraightPlanner(), 0.5, period=0.02)
     assert driver_of(robot, pilot, observers=[seen]).run(GOAL).reached
-    assert pilot.late == 1
     assert all(record.plan_age >= 0.0 for record in seen.records if record.mode is Mode.RUNNING)
+
+
+def test_a_plan_that_comes_from_the_future_is_not_adopted():
+    pilot = pilot_for(StraightPlanner(), 0.05)
+
+    def act(now: float, stamp: float) -> Decision:
+        estimate = Estimate(stamp, np.zeros(3), np.zeros(2), np.eye(6), upright=1.0, yaw_rate=0.0)
+        return pilot.act(now, estimate, {}, GOAL, map_with())
+
+    act(0.0, 50.0)
+    assert not act(0.1, 0.1).replanned and pilot.late == 1
+    assert act(0.2, 0.2).replanned
 
 
 def test_a_fault_from_a_clock_that_starts_again_can_be_acknowledged():
