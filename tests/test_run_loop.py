@@ -263,10 +263,10 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.5)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 0, errors
+    assert process.returncode == 0, output + errors
     assert "Traceback" not in errors
     episodes = json.loads((tmp_path / "summary.json").read_text())["episodes"]
     assert [episode["reason"] for episode in episodes][1:] == ["interrupted"]
