@@ -150,16 +150,20 @@ def test_a_robot_whose_speed_is_not_measured_is_not_shown_to_stand(silent):
     assert result.reason == "fault" and not result.stopped
 
 
+def frozen_after(stamp: float) -> Callable[[SensorFrame], SensorFrame]:
+    """What a robot sees that shows the same frame again and again after `stamp` [s]."""
+    last: list[SensorFrame] = []
+
+    def sees(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp > stamp:
+            last.append(frame)
+        return last[0] if last else frame
+
+    return sees
+
+
 def test_a_fault_that_is_acknowledged_does_not_make_dead_sensors_good():
-    frozen: list[SensorFrame] = []
-
-    def freeze(frame: SensorFrame) -> SensorFrame:
-        if frame.stamp > 0.55:
-            frozen.append(frame)
-            return frozen[0]
-        return frame
-
-    robot, modes = Puck(sees=freeze), []
+    robot, modes = Puck(sees=frozen_after(0.55)), []
 
     class Watcher(Observer):
         def tick(self, record: TickRecord) -> None:
@@ -211,15 +215,7 @@ def test_a_robot_waits_for_its_first_fix_and_then_goes():
 
 
 def test_sensors_that_repeat_themselves_are_not_driven_on_for_long():
-    frozen: list[SensorFrame] = []
-
-    def freeze(frame: SensorFrame) -> SensorFrame:
-        if frame.stamp > 0.35:
-            frozen.append(frame)
-            return frozen[0]
-        return frame
-
-    robot = Puck(sees=freeze)
+    robot = Puck(sees=frozen_after(0.35))
     result = driver_of(robot, Scripted(lambda step, straight: np.array([0.1, 0.0]))).run(GOAL)
     assert result.reason == "fault" and "no new sensor frame for 0.8" in result.fault
     assert result.steps == 7
