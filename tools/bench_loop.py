@@ -19,7 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
 
 import numpy as np
 
@@ -70,23 +71,24 @@ def measure(
     from hiernav.runtime.clock import MonotonicClock
     from hiernav.runtime.driver import Driver, DriverConfig
     from hiernav.runtime.estimator import Estimator, EstimatorConfig
-    from hiernav.runtime.guard import Guard, GuardConfig
+    from hiernav.runtime.guard import Guard
     from hiernav.runtime.observe import Event, Observer, TickRecord
     from hiernav.runtime.pilot import Pilot
     from hiernav.runtime.policy import make_agent
     from hiernav.runtime.process_planner import ProcessPlanner
     from hiernav.runtime.process_robot import simulated
     from hiernav.runtime.realtime import RealtimeConfig, request_realtime
+    from hiernav.runtime.settings import load_settings
     from hiernav.sim.layout import parse_world
     from hiernav.sim.worlds import sample_layout
 
-    robot = simulated(robot="point", world=WORLD, seed=0, substeps=500 // rate)
     bundle = load_bundle(bundle_path)
+    robot = simulated(robot="point", world=WORLD, seed=0, substeps=500 // rate)
     layout = sample_layout(parse_world(WORLD), 0)
     occupancy = layout.occupancy(0.0)
     link = ProcessPlanner(bundle, 0.1, occupancy.occupied.size)
     pilot = Pilot(make_agent(bundle, 0.1, planner=link), link)
-    guard = Guard(2, GuardConfig(slow_ttc=0.3, slowed=(0,)))
+    guard = Guard(2, load_settings(ROOT / "deploy" / "point.yaml").guard)
     estimator, config = Estimator(EstimatorConfig(tilts=False)), DriverConfig(max_steps=10**9)
     driver = Driver(
         robot, pilot, lambda stamp: occupancy, MonotonicClock(), estimator, guard, config, rehearsal=rehearsal
@@ -201,4 +203,6 @@ def process_age() -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bad_input import exit_code
+
+    sys.exit(exit_code("bench_loop", main))
