@@ -22,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-import numpy as np
+import numpy as np  # noqa: E402
 
 WORLD = "pillar(4,4,40)"
 RUNS = ((50, 60.0, 0), (100, 60.0, 0), (50, 60.0, 2), (500, 10.0, 0))
