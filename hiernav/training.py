@@ -23,9 +23,23 @@ def train(run: Run, stage: str, progress: Progress) -> None:
     """Train "planner", "skill" or "all" of a run, from its last checkpoints on.
 
     Raises:
+        KeyboardInterrupt: somebody pressed Ctrl-C, whatever a library that was interrupted made of it.
         TrainingDiverged: a loss, a weight or the physics is not finite.
         RunError: the run folder cannot be written to.
     """
+    try:
+        _train(run, stage, progress)
+    except Exception as error:
+        # what tensordict does in the middle of its bookkeeping fails otherwise where it is interrupted
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise cause from None
+            cause = cause.__context__
+        raise
+
+
+def _train(run: Run, stage: str, progress: Progress) -> None:
     torch.set_num_threads(run.config.threads)
     if run.config.skill.preset == "baseline":
         if stage == "planner":

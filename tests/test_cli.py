@@ -367,6 +367,18 @@ def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, ca
     assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [7680]
 
 
+def test_ctrl_c_in_the_middle_of_a_librarys_bookkeeping_is_ctrl_c(tmp_path, capsys, monkeypatch):
+    def interrupted(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise RuntimeError("cannot close what was not opened")
+
+    monkeypatch.setattr("hiernav.skill.train.SkillTrainer.train", interrupted)
+    assert cli.main(["train", "--stage", "skill", *tiny_run.arguments(tmp_path / "run")]) == 130
+    assert "stopped; go on from the last checkpoint" in capsys.readouterr().err
+
+
 def start(*arguments: str) -> subprocess.Popen[str]:
     command: Sequence[str] = (sys.executable, "-m", "hiernav.cli", *arguments)
     # where the tests run in the background of a shell, Ctrl-C is ignored by all that they start
