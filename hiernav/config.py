@@ -153,7 +153,7 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             description="Steps between checkpoints, at which all episodes begin anew; "
             "about 150 of every simulation where that is more.",
         ),
-    ] = 5_000
+    ] = 20_000
     stop_reach_rate: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
         Meta(description="Stop once an evaluation reaches this rate; null: never."),

@@ -91,8 +91,10 @@ def path_distance(before: np.ndarray, after: np.ndarray, vertices: np.ndarray, s
     Returns:
         (N,) max over the motion of the distance to the closest plan vertex [m]; NaN where a row is NaN.
     """
-    pieces = max(int(np.ceil(_longest(_length(after - before)) / spacing - 1e-9)), 1)
-    t = (np.arange(pieces + 1) / pieces)[None, :, None]
+    lengths = _length(after - before)
+    # each row has its own number of pieces, and the last point again where others have more
+    pieces = np.ceil(np.where(np.isfinite(lengths), lengths, 0.0) / spacing - 1e-9).clip(1.0)
+    t = _unit(np.arange(pieces.max(initial=1.0) + 1.0) / pieces[:, None])[..., None]
     motion = (1.0 - t) * before[:, None, :] + t * after[:, None, :]
     return nearest_vertex(motion, vertices)[1].max(axis=1)
 

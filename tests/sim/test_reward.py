@@ -8,6 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from hiernav.config import RewardConfig, load_config
+from hiernav.nav import path
 from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
 from hiernav.nav.option import WaypointOption
 from hiernav.nav.path import polyline
@@ -75,6 +76,16 @@ def test_standing_still_on_a_waypoint_is_worth_nothing_but_its_time() -> None:
     assert terms.pop("time") == 1.0
     assert terms.pop("goal_distance") == pytest.approx(1.7)
     assert terms == pytest.approx(dict.fromkeys(terms, 0.0), abs=1e-12)
+
+
+def test_no_row_depends_on_how_far_the_others_moved() -> None:
+    line = np.stack([np.linspace(0.0, 1.0, 11), np.zeros(11)], axis=-1)[None]
+    vertices = path.divide(np.repeat(line, 3, axis=0), 0.1)
+    before, after = np.zeros((3, 2)), np.array([[0.1, 0.0], [0.37, 0.0], [np.nan, 0.0]])
+    together = path.path_distance(before, after, vertices, 0.1)
+    alone = [path.path_distance(before[i, None], after[i, None], vertices[i, None], 0.1)[0] for i in range(3)]
+    np.testing.assert_array_equal(together, alone)
+    assert together[0] == pytest.approx(0.0, abs=1e-9), "both ends of this motion are vertices"
 
 
 def test_path_distance_is_the_largest_distance_from_the_plan() -> None:

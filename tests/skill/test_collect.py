@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from hiernav.config import load_config
+from hiernav.sim.layout import parse_world
 from hiernav.skill.collect import segment_frames, training_layouts, training_worlds
 
 pytestmark = pytest.mark.train
@@ -26,10 +27,17 @@ def test_without_phasing_in_all_worlds_are_there_from_the_start() -> None:
     assert len(training_worlds(CONFIG.skill, 0)) == 3
 
 
+@pytest.mark.parametrize("robot", ["point", "car", "doggo", "baseline-point"])
+def test_an_episode_can_time_out_before_its_segment_ends(robot: str) -> None:
+    skill = load_config(CONFIGS / f"{robot}.yaml").skill
+    cap = skill.episode_steps or max(parse_world(world).max_steps for world in skill.worlds)
+    assert segment_frames(skill, 0) / skill.num_envs >= cap
+
+
 @pytest.mark.parametrize(
     ("robot", "settings", "frames"),
     [
-        *[("point", [], 5_000), ("car", [], 5_000), ("doggo", [], 20_000)],
+        *[(robot, [], 20_000) for robot in ("point", "car", "doggo", "baseline-point")],
         ("doggo", ["skill.workers=32"], 20_000),  # whom nobody asks
         ("doggo", ["skill.collector=multi", "skill.workers=32"], 150 * 32 * 32),
         ("point", ["skill.num_envs=512"], 150 * 512),
