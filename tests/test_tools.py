@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
         (["planner_walks.py", "--world", "foo"], "planner_walks: world 'foo': unknown;"),
         (["planner_scale.py", "--bundle", "/nope"], "planner_scale: /nope: no such folder"),
         (["noise_table.py", "--bundle", "/nope"], "noise_table: /nope: no such folder"),
+        (["training_race.py", "--config", "/nope"], "training_race: /nope: cannot be read"),
         (["bench.py", "--tick", "--bundle", "/nope"], "bench: /nope: no such folder"),
     ],
 )
