@@ -13,13 +13,18 @@ from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import arc_lengths, polyline
-from hiernav.nav.search import CELL, PathField
+from hiernav.nav.search import CELL, PathField, keeps_room
 
 Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
 scores (M, H) of H hypotheses."""
 
 _FARTHEST = 100.0
+_DIP = 0.15 * CELL
+"""What a shortest path may lack of its radius [m]: the disc is known to fit at the centres of cells, and between two of
+them the clearance may be lower."""
+_SPACING = 0.05
+"""At which plans are swept [m]."""
 _TIGHTNESS = 4.0
 """Score that a hypothesis loses which leaves nothing beyond the radius."""
 
@@ -136,8 +141,10 @@ class VerifiedPlanner:
 
     A proposal is bad if its sweep meets the map, if its second half leads where the robot has been, or if it does not
     bring the robot nearer to the goal along the shortest path: a network without memory can lead to and fro between two
-    ways, a shortest path never does. Counts proposals, repairs, loops and detours among them (of the second and third
-    kind) and refusals (no path exists either: the row is NaN then, or the proposal if it is free).
+    ways, a shortest path never does. A shortest path is swept as well, and is no repair where the disc does not fit
+    along it; only on the way out of where it does not fit from the start, it may lack room. Counts proposals, repairs,
+    loops and detours among them (of the second and third kind) and refusals (there is no repair and the proposal is not
+    free: the row is NaN then; a free proposal stands).
     """
 
     planner: Planner
@@ -179,7 +186,8 @@ class VerifiedPlanner:
             query.previous[bad],
         )
         repaired = self.repair.plan(part)
-        found = np.isfinite(repaired).all(axis=(1, 2))
+        found = self._fits(repaired, part)
+        repaired[~found] = np.nan
         refused = np.flatnonzero(~found & ~free[bad]).tolist()
         plans = plans.copy()
         plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
@@ -187,13 +195,22 @@ class VerifiedPlanner:
         self.loops += int((found & back[bad]).sum())
         self.detours += int((found & away[bad]).sum())
         self.refusals += len(refused)
-        self.reasons.update(self.repair.refusal(part, row) or "unknown" for row in refused)
+        self.reasons.update(self.repair.refusal(part, row) or "tight" for row in refused)
         return plans
 
     def counts(self) -> dict[str, int]:
         """Proposals, repairs, loops and detours among them, refusals and why, `refusals/...`, since the start."""
         totals = {name: getattr(self, name) for name in COUNTS}
         return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
+
+    def _fits(self, repaired: np.ndarray, query: PlanQuery) -> np.ndarray:
+        """Whether shortest paths (M, K, 2), NaN where there is none, leave the disc room: (M,) bool."""
+        radius = min(self.radius, self.repair.radius)
+        fits = np.isfinite(repaired).all(axis=(1, 2))
+        for row in np.flatnonzero(fits).tolist():
+            points, _ = _sampled(query.position[row][None], repaired[row][None], _SPACING)
+            fits[row] = keeps_room(query.occupancy[row].clearance_at(points), radius, _DIP)[0]
+        return fits
 
     def _leads_away(self, query: PlanQuery, plan: np.ndarray, row: int) -> bool:
         # behind the goal every way leads away from it
@@ -227,7 +244,9 @@ def apart_from(previous: np.ndarray, position: np.ndarray, candidates: np.ndarra
     return (apart * left).sum(axis=-1) / left.sum(axis=-1)
 
 
-def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap, spacing: float = 0.05) -> np.ndarray:
+def swept_clearance(
+    start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap, spacing: float = _SPACING
+) -> np.ndarray:
     """Smallest clearance on the way along plans, beyond what the start itself lacks.
 
     The first 0.15 m do not count where they lead away from an obstacle that the robot already stands too close to.
@@ -240,7 +259,17 @@ def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMa
         (M,) [m].
     """
     finite = (np.abs(plans - start[:, None]) <= _FARTHEST).all(axis=(1, 2))
-    line = polyline(start, np.where(finite[:, None, None], plans, start[:, None]))
+    points, arc = _sampled(start, np.where(finite[:, None, None], plans, start[:, None]), spacing)
+    clearance = occupancy.clearance_at(points)
+    ahead, escape = clearance[:, 1:], clearance[:, :1]
+    excused = (arc < 0.15 - 1e-9) & (ahead >= clearance[:, :-1] - 1e-6) & (ahead >= escape - 1e-6)
+    # the start itself is where the robot is, whatever the plan
+    return np.where(finite, np.where(excused, np.inf, ahead).min(axis=1, initial=np.inf), np.nan)
+
+
+def _sampled(start: np.ndarray, plans: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points along plans from their starts on, at most `spacing` [m] apart: (M, S, 2), and arc lengths (M, S - 1)."""
+    line = polyline(start, plans)
     steps = np.diff(line, axis=1)
     lengths = np.sqrt((steps * steps).sum(axis=-1))
     # as many pieces of every step as the longest one needs
@@ -248,12 +277,7 @@ def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMa
     t = np.arange(pieces) / pieces
     points = line[:, :-1, None] + t[:, None] * steps[:, :, None]
     points = np.concatenate([points.reshape(len(line), -1, 2), line[:, -1:]], axis=1)
-    arc = np.cumsum(np.repeat(lengths / pieces, pieces, axis=1), axis=1)
-    clearance = occupancy.clearance_at(points)
-    ahead, escape = clearance[:, 1:], clearance[:, :1]
-    excused = (arc < 0.15 - 1e-9) & (ahead >= clearance[:, :-1] - 1e-6) & (ahead >= escape - 1e-6)
-    # the start itself is where the robot is, whatever the plan
-    return np.where(finite, np.where(excused, np.inf, ahead).min(axis=1, initial=np.inf), np.nan)
+    return points, np.cumsum(np.repeat(lengths / pieces, pieces, axis=1), axis=1)
 
 
 def verified_planner(

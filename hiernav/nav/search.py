@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 CELL = 0.1  # [m], planning grid of the paper
 _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
 GOAL_REACH = 0.3  # [m], a goal with no room for the disc within this is blocked
+LEAD = 4.0 * CELL  # [m], beyond its radius, as far as a robot is led to where its way begins
+_DIP = 0.005  # [m], fall of the clearance along a lead that is put down to the pixels of the map
 _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line
 
 
@@ -29,6 +31,7 @@ REFUSALS = {
     "no_room": "the robot fits nowhere on the map",
     "goal_blocked": "the robot fits nowhere within 0.3 m of the goal",
     "enclosed": "no way leads from the position to the goal",
+    "tight": "the robot does not fit along the first waypoints of the way to the goal",
 }
 """Why there may be no path."""
 
@@ -73,7 +76,6 @@ class PathField:
                 self._end = self._centers[self.goal_cell]
             graph = _grid_graph(self._free.reshape(self._shape), self._factor(clearance).reshape(self._shape))
             self._cost, self._next = dijkstra(graph, indices=self.goal_cell, return_predecessors=True)
-        self._entry: np.ndarray | None = None
 
     def distance_at(self, points: np.ndarray) -> np.ndarray:
         """Cost to go [m] of the cells that (M, 2) points lie in; inf where no path starts."""
@@ -82,8 +84,10 @@ class PathField:
     def path_from(self, start: np.ndarray, max_vertices: int | None = None) -> np.ndarray | None:
         """Vertices (K, 2) from a start to the goal, both included; None if there is no path.
 
-        A start from whose own cell no path leads (too close to an obstacle) is led straight to the nearest cell from
-        which one does, unless an obstacle lies between. With `max_vertices` the path ends early, at a cell on the way.
+        A start from whose own cell no path leads is led straight to the nearest cell within `radius` + `LEAD` from
+        which one does and to which the disc can move: the clearance may not fall on the way there until the disc fits,
+        and the disc must fit from then on. A start with room is thus never led through a gap, and one too close to an
+        obstacle is led out of it. With `max_vertices` the path ends early, at a cell on the way.
         """
         start = np.asarray(start, dtype=np.float64)
         own = int(self._cells(start[None])[0])
@@ -185,29 +189,34 @@ class PathField:
 
     def _entry_for(self, start: np.ndarray, own: int) -> int | None:
         """The cell at which a path from `start` (2,) in cell `own` begins, None if there is none."""
-        cell = int(self._entries()[own])
-        if cell == own or cell < 0:
-            return cell if cell >= 0 else None
-        length = float(np.linalg.norm(self._centers[cell] - start))
-        t = np.linspace(0.0, 1.0, 2 + int(2.0 * length / self.occupancy.resolution))[:, None]
-        met = self.occupancy.occupied_at((1.0 - t) * start + t * self._centers[cell])
-        # what the start itself stands in, by a pose a little wrong, may be left; nothing else may be crossed
-        return None if met[met.argmin() :].any() else cell
+        if np.isfinite(self._cost[own]):
+            return own
+        reach = self.radius + LEAD
+        (row, col), around = divmod(own, self._shape[1]), int(reach / CELL) + 1
+        rows = np.arange(max(row - around, 0), min(row + around + 1, self._shape[0]))
+        cols = np.arange(max(col - around, 0), min(col + around + 1, self._shape[1]))
+        cells = (rows[:, None] * self._shape[1] + cols).ravel()
+        cells = cells[np.isfinite(self._cost[cells])]
+        apart = np.linalg.norm(self._centers[cells] - start, axis=-1)
+        near = np.argsort(apart, kind="stable")[: np.count_nonzero(apart <= reach)]
+        fit = np.flatnonzero(self._can_be_led(start, self._centers[cells[near]]))
+        return int(cells[near[fit[0]]]) if len(fit) else None
 
-    def _entries(self) -> np.ndarray:
-        """For every cell the nearest one from which the goal can be reached, -1 if there is none."""
-        if self._entry is None:
-            self._entry = np.full(len(self._cost), -1)
-            reachable = np.flatnonzero(np.isfinite(self._cost))
-            if len(reachable):
-                far = np.isinf(self._cost).reshape(self._shape).astype(np.uint8)
-                _, label = cv2.distanceTransformWithLabels(
-                    far, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-                )
-                cell_of_label = np.zeros(int(label.max()) + 1, dtype=np.int64)
-                cell_of_label[label.flat[reachable]] = reachable
-                self._entry = cell_of_label[label.ravel()]
-        return self._entry
+    def _can_be_led(self, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Whether the disc can move straight from a start (2,), where it need not fit, to ends (M, 2): (M,) bool."""
+        t = np.linspace(0.0, 1.0, 2 + int(2.0 * (self.radius + LEAD) / _SAMPLE))[:, None]
+        clearance = self.occupancy.clearance_at((1.0 - t) * start + t * ends[:, None])
+        return keeps_room(clearance, self.radius, _DIP)
+
+
+def keeps_room(clearance: np.ndarray, radius: float, dip: float) -> np.ndarray:
+    """Whether a disc can move where the clearance is (M, S) [m] in order of the way: (M,) bool.
+
+    Where it does not fit from the start, the clearance may not fall until it fits; from then on it must fit, but for a
+    `dip` [m]. It must fit at the end.
+    """
+    most = np.minimum(np.maximum.accumulate(clearance, axis=1), radius)
+    return (clearance >= most - dip).all(axis=1) & (clearance[:, -1] >= radius - dip)
 
 
 def is_solvable(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, radius: float) -> bool:

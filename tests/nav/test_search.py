@@ -12,7 +12,7 @@ from nav_planners import map_with_pillars, pillar_world
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
-from hiernav.nav.search import CELL, PathField, is_solvable, random_shortcuts, resample
+from hiernav.nav.search import CELL, LEAD, PathField, is_solvable, random_shortcuts, resample
 from hiernav.sim.worlds import parse_world, sample_layout
 
 RADIUS = 0.1
@@ -110,6 +110,43 @@ def test_no_path_leads_through_a_wall() -> None:
         assert field.waypoints(start) is None
         assert not is_solvable(field.occupancy, start, field.goal, RADIUS)
     assert field.path_from(np.array([0.3, 0.12])) is not None
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.2])
+@pytest.mark.parametrize("start", [(0.0, -0.6), (0.0, -0.25), (0.0, -0.12), (0.03, -1.7), (0.2, -0.3)])
+def test_a_start_is_not_led_through_an_opening_that_the_disc_does_not_fit(radius: float, start: tuple) -> None:
+    """Whether the disc fits at the start or, as close to the wall as that, does not."""
+    opening = walls((-1.025, 0.0, 0.975, 0.05), (1.025, 0.0, 0.975, 0.05))
+    assert not opening.occupied_at([[0.0, y] for y in (-0.05, 0.0, 0.05)]).any(), "0.1 m wide"
+    field = PathField(opening, np.array([0.0, 1.0]), radius)
+    assert field.path_from(np.array(start)) is None and field.waypoints(np.array(start)) is None
+    assert field.refusal(np.array(start)) == "enclosed"
+    assert not is_solvable(opening, np.array(start), field.goal, radius)
+    assert field.refusal(np.array([0.0, 0.6])) is None
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.2])
+def test_a_lead_is_short_and_the_disc_moves_along_it(radius: float) -> None:
+    """It fits all along where it fits at the start; where it does not, there is ever more room until it does."""
+    led = np.zeros(2, int)
+    for seed in range(6):
+        layout = sample_layout(parse_world("pillar(2,2,10)"), seed, radius)
+        occupancy = layout.occupancy(0.0)
+        field = PathField(occupancy, layout.goal, radius)
+        for start in np.random.default_rng(seed).uniform(-2.0, 2.0, (150, 2)):
+            if np.isfinite(field.distance_at(start[None])[0]) or not occupancy.clearance_at(start) > 0.0:
+                continue
+            path = field.path_from(start, max_vertices=1)
+            if path is None:
+                continue
+            clearance = occupancy.clearance_at(sampled(path))
+            assert length_of(path) <= radius + LEAD
+            has_room = clearance[0] >= radius
+            led[int(has_room)] += 1
+            fits = 0 if has_room else int(np.argmax(clearance >= radius))
+            assert (clearance[fits:] >= radius - 0.008).all()
+            assert (np.maximum.accumulate(clearance)[: fits + 1] - clearance[: fits + 1] <= 0.008).all()
+    assert led.min() >= 2
 
 
 def test_a_goal_walled_in_is_not_reached_from_outside() -> None:

@@ -11,7 +11,7 @@ from nav_planners import WatchedPlanner, map_with_pillars, query_of
 from hiernav.nav.bundle import load_bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import PlanQuery
-from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner, apart_from
+from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, StraightPlanner, VerifiedPlanner, apart_from
 from hiernav.nav.search import GOAL_REACH, REFUSALS, PathField
 from hiernav.runtime.policy import load_policies
 from hiernav.sim.layout import Layout, parse_world
@@ -81,6 +81,52 @@ def test_a_refusal_has_a_reason(reason: str, occupancy: OccupancyMap, start, goa
     assert np.isnan(planner.plan(query_of([start], [goal], occupancy))).all()
     assert planner.refusals == 1
     assert planner.counts()[f"refusals/{reason}"] == 1 and reason in REFUSALS
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.2])
+@pytest.mark.parametrize("start", [(0.0, -0.6), (0.0, -0.9)])
+def test_a_plan_through_a_gap_that_the_disc_does_not_fit_is_no_repair(radius: float, start) -> None:
+    opening = map_with_pillars(half_size=(2.0, 2.0))
+    opening.occupied[39:41] = True
+    opening.occupied[39:41, 39:41] = False  # 0.1 m wide
+    planner = VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(radius), radius)
+    assert np.isnan(planner.plan(query_of([start], [(0.0, 1.0)], opening))).all()
+    assert (planner.repairs, planner.refusals, dict(planner.reasons)) == (0, 1, {"enclosed": 1})
+
+
+def test_a_shortest_path_along_which_the_disc_does_not_fit_is_no_repair() -> None:
+    """Whoever made it: here one that keeps too little room."""
+    opening = map_with_pillars(half_size=(2.0, 2.0))
+    opening.occupied[39:41] = True
+    opening.occupied[39:41, 37:43] = False  # 0.3 m wide
+    planner = VerifiedPlanner(StraightPlanner(), ShortestPathPlanner(0.2), 0.2)
+    careless = ShortestPathPlanner(0.1).plan
+    planner.repair.plan = careless
+    assert np.isfinite(careless(query_of([(0.0, -0.6)], [(0.0, 1.0)], opening))).all()
+    assert np.isnan(planner.plan(query_of([(0.0, -0.6)], [(0.0, 1.0)], opening))).all()
+    assert (planner.repairs, planner.refusals) == (0, 1)
+
+
+@pytest.mark.parametrize("world", ["pillar(2,2,10)", "pillar(4,4,40)"])
+def test_what_the_verified_expert_hands_out_fits_the_disc_once_it_has_fitted(world: str) -> None:
+    """From anywhere: where the disc does not fit at the start, the way leads out of there, and not in again."""
+    radius, tight, planner = 0.2, 0, verified(0.2)
+    for layout in layouts_of(world, 4, radius):
+        occupancy = layout.occupancy(0.0)
+        xmin, xmax, ymin, ymax = occupancy.extent
+        starts = np.random.default_rng(1).uniform((xmin, ymin), (xmax, ymax), (80, 2))
+        starts = starts[occupancy.clearance_at(starts) > 0.03]
+        plans = planner.plan(query_of(starts, [layout.goal] * len(starts), occupancy))
+        for start, plan in zip(starts, plans, strict=True):
+            if np.isnan(plan).any():
+                continue
+            line = np.concatenate([start[None], plan])
+            points = np.concatenate([np.linspace(a, b, 5) for a, b in zip(line[:-1], line[1:], strict=True)])
+            clearance = occupancy.clearance_at(points)
+            fits = int(np.argmax(clearance >= radius))
+            assert clearance[fits] >= radius and (clearance[fits:] >= radius - 0.02).all()
+            tight += fits > 0
+    assert tight > 20 and planner.repairs > 50
 
 
 def test_a_goal_a_little_too_close_to_a_wall_is_gone_to_as_near_as_the_disc_fits() -> None:
