@@ -111,6 +111,9 @@ class GoseloPlanner:
     def select(self, candidates: np.ndarray, scores: np.ndarray, query: PlanQuery) -> np.ndarray:
         """Pick one hypothesis per row: free of collision first, then score and agreement with the previous plan.
 
+        Those that keep `radius` clear come before all that do not, and these before those that are no numbers. Among
+        equals score, agreement and room are weighed.
+
         Args:
             candidates: (M, H, K, 2) world frame [m].
             scores: (M, H), log-probabilities or the like.
@@ -127,7 +130,9 @@ class GoseloPlanner:
         shortfall = np.clip(self.radius - clearance, 0.0, None) / self.radius
         tight = np.clip(1.0 - (clearance - self.radius) / max(self.margin, 1e-6), 0.0, 1.0)
         merit = scores + self.hysteresis * agreement - 100.0 * shortfall - _TIGHTNESS * tight**2
-        best = merit.argmax(axis=1)
+        free, known = clearance >= self.radius, np.isfinite(merit)
+        eligible = np.where((free & known).any(axis=1, keepdims=True), free & known, known)
+        best = np.where(eligible, merit, -np.inf).argmax(axis=1)
         return candidates[np.arange(len(candidates)), best]
 
 

@@ -235,6 +235,34 @@ def test_a_hypothesis_free_of_collision_beats_one_with_a_better_score() -> None:
     assert_allclose(GoseloPlanner(Fan(scores=(5.0, 0.0, 1.0))).plan(in_the_open)[0], straight((0, 0), 0.0), atol=1e-6)
 
 
+def test_a_hypothesis_that_is_exactly_free_beats_one_a_little_short_of_it_however_good_its_score() -> None:
+    level = straight((0.0, 0.0), 0.0)
+    walled = map_with_pillars()
+    walled.occupied[63:] = True  # from y = 0.15 m on
+    candidates = np.stack([level + [0.0, 0.055], level - [0.0, 0.05]])[None]
+    clearance = swept_clearance(np.zeros((2, 2)), candidates[0], walled)
+    assert 0.085 < clearance[0] < 0.1 <= clearance[1]
+    query = query_of([(0.0, 0.0)], [(2.0, 0.0)], walled)
+    for scores in ((0.0, 0.0), (50.0, 0.0)):
+        assert_array_equal(GoseloPlanner(Fan()).select(candidates, np.array([scores]), query)[0], candidates[0, 1])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("occupancy", [FREE, PILLAR], ids=["free", "in the way"])
+def test_a_hypothesis_that_is_no_number_comes_last(bad: float, occupancy) -> None:
+    level = straight((0.0, 0.0), 0.0)
+    broken = level.copy()
+    broken[4] = bad
+    query = query_of([(0.0, 0.0)], [(2.0, 0.0)], occupancy)
+    planner = GoseloPlanner(Fan())
+    for candidates in (np.stack([broken, level]), np.stack([level, broken])):
+        assert_array_equal(planner.select(candidates[None], np.array([[0.0, 0.0]]), query)[0], level)
+    for scores in ((bad, 0.0), (0.0, bad)):
+        chosen = planner.select(np.stack([level, level])[None] + 0.0, np.array([scores]), query)[0]
+        assert np.isfinite(chosen).all()
+    assert planner.select(np.stack([broken, broken])[None], np.array([[0.0, 0.0]]), query).shape == (1, 10, 2)
+
+
 def test_of_hypotheses_that_all_collide_the_one_with_most_room_is_taken() -> None:
     walled = map_with_pillars([(0.6, 0.05), (0.45, 0.75), (0.65, -0.45)])
     clearance = [swept_clearance(np.zeros((1, 2)), straight((0, 0), a)[None], walled)[0] for a in (0.0, 0.9, -0.9)]
