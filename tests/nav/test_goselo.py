@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from nav_planners import map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hiernav.nav import goselo
 from hiernav.nav.goselo import CHANNELS, CLEARANCE_CLIP, MIN_DISTANCE, PIXELS, VISIT_CLIP, GoseloFrame, images
 from hiernav.nav.occupancy import OccupancyMap, VisitMap, draw_boxes, empty_map
 
@@ -260,3 +261,45 @@ def test_an_image_does_not_depend_on_the_other_robots(seed: int) -> None:
     for row, (_, position, goal) in enumerate(scenes):
         alone = image_of(maps[row], position, goal, channels=CHANNELS)
         assert_array_equal(together[row] / 255.0, np.stack(list(alone.values())))
+
+
+# long and narrow maps
+
+
+@pytest.mark.parametrize("length", [2000, 8000])
+def test_a_long_and_narrow_map_is_shown_in_milliseconds(length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From one end of a corridor 0.75 m wide to the other: the image warped for a crop stays small."""
+    warped: list[tuple[int, int]] = []
+    warp = cv2.warpAffine
+
+    def noting(image: np.ndarray, matrix: np.ndarray, size: tuple[int, int], **options: object) -> np.ndarray:
+        assert max(size) <= 16 * PIXELS
+        warped.append(size)
+        return warp(image, matrix, size, **options)
+
+    monkeypatch.setattr(cv2, "warpAffine", noting)
+    corridor = OccupancyMap(np.zeros((15, length), bool))
+    shown = image_of(corridor, (0.3, 0.35), (length * 0.05 - 0.5, 0.35))
+    assert warped and max(side for size in warped for side in size) <= 9 * PIXELS
+    # the corridor is less than a pixel wide, in the middle of what is occupied
+    assert shown["obstacles_1"][:, :28].min() == shown["obstacles_1"][:, 36:].min() == 1.0
+    assert (shown["obstacles_1"][4:60, 28:36].min(axis=1) < 1.0).all()
+
+
+def test_a_goal_far_beyond_the_map_is_shown_as_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    warp = cv2.warpAffine
+
+    def checked(image: np.ndarray, matrix: np.ndarray, size: tuple[int, int], **options: object) -> np.ndarray:
+        assert max(size) <= 16 * PIXELS
+        return warp(image, matrix, size, **options)
+
+    monkeypatch.setattr(cv2, "warpAffine", checked)
+    shown = image_of(empty_map((2.0, 2.0)), (0.0, 0.0), (1e6, 0.0))
+    assert shown["obstacles_4"].min() > 0.9
+
+
+@pytest.mark.parametrize("shape", [(80, 80), (40, 80), (20, 100), (127, 16), (400, 400), (100, 700)])
+def test_up_to_eight_times_as_long_as_wide_a_map_has_the_levels_down_to_a_width_of_8_to_15_pixels(shape) -> None:
+    levels = goselo._halve(np.zeros(shape, np.uint8), outside=255)
+    widths = [min(level.shape) for level in levels]
+    assert all(width >= 16 for width in widths[:-1]) and 8 <= widths[-1] < 16
