@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hiernav.nav import goselo
-from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.occupancy import OccupancyMap, nearest_pixel
 from hiernav.planner import dataset
 from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples
 from hiernav.sim.layout import parse_world
@@ -131,12 +131,37 @@ def test_labels_lead_through_free_space_and_away_from_obstacles(drawn):
 def test_half_of_the_starts_have_been_driven_to_and_show_it(paper):
     visits = paper.samples.image[:, 3:6]
     order = np.arange(40) % 2 == 1
-    np.testing.assert_array_equal(visits.any(axis=(1, 2, 3)), order)
+    # how much of a crop is lit, in pixels that a robot came into once
+    driven = visits[:, 2].sum(axis=(1, 2)) * (4.0 * paper.samples.distance / 64 / 0.05) ** 2 / 63.0
+    assert (driven[~order] < 2.0).all(), "only where they stand"
     # the way there ends near the robot, half of L below the centre: 16 pixels of the crop of side 4 L are L
     far = order & (paper.samples.distance > 0.8)
     near = visits[far, 2, 32:48, 24:40]
     assert far.sum() >= 5  # they stand all along the way, not mostly at its end
     assert near.any(axis=(1, 2)).all()
+    assert np.median(driven[far]) > 5.0
+
+
+def test_every_start_is_among_the_visits_as_it_is_when_a_robot_plans(monkeypatch):
+    """What `WaypointOption` does first: enter the pixel that the robot stands in."""
+    shown = []
+    images = goselo.images
+
+    def noting(occupancy, visits, frame, channels):
+        shown.extend(zip(visits, frame.position, strict=True))
+        return images(occupancy, visits, frame, channels)
+
+    monkeypatch.setattr(goselo, "images", noting)
+    paper = replace(SETTINGS, random_smoothing=True, soft_margin=0.0, channels=goselo.CHANNELS)
+    make_samples(paper, 16, (3,))
+    assert len(shown) == 16
+    for seen, start in shown:
+        assert seen.counts[nearest_pixel(start, seen.counts.shape, seen.resolution, seen.origin)] >= 1
+        before = seen.counts.copy()
+        seen.add(start)
+        assert np.array_equal(seen.counts, before), "the robot is there"
+    assert [int(seen.counts.sum()) for seen, _ in shown[::2]] == [1] * 8
+    assert np.median([int(seen.counts.sum()) for seen, _ in shown[1::2]]) > 2
 
 
 def test_labels_avoid_the_same_obstacles_that_the_images_show(drawn):
