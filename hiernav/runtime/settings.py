@@ -52,7 +52,8 @@ def load_settings(
         defaults: values by section and key that the robot itself asks for.
 
     Raises:
-        ConfigError: the file cannot be read, or a section, key or value is not one that `Settings` takes.
+        ConfigError: the file cannot be read, or a section, key or value is not one that `Settings` takes; names the
+            file or the command line, whichever it came from.
     """
     values = {name: dict(section) for name, section in (defaults or {}).items()}
     if path is not None:
@@ -61,25 +62,48 @@ def load_settings(
             if not isinstance(section, dict):
                 raise ConfigError(f"{path}: {name} must be a section with settings, it is {section!r}")
             values.setdefault(name, {}).update(section)
+    given: dict[str, dict[str, Any]] = {}
     for override in overrides:
         key, equals, text = override.partition("=")
         name, dot, leaf = key.partition(".")
         if not (equals and dot):
             raise ConfigError(f"command line: {override!r}, expected section.key=value")
         _known(name, list(_SECTIONS), "command line")
-        values.setdefault(name, {})[leaf] = parse_yaml(text, f"command line: {key}")
+        _known(leaf, _keys(name), f"command line: {name}")
+        given.setdefault(name, {})[leaf] = parse_yaml(text, f"command line: {key}")
     source = "settings" if path is None else str(path)
-    return Settings(**{name: _section(name, section, source) for name, section in values.items()})
+    names = [name for name in _SECTIONS if name in values or name in given]
+    return Settings(**{name: _section(name, values.get(name, {}), given.get(name, {}), source) for name in names})
 
 
-def _section(name: str, values: Mapping[str, Any], source: str) -> Any:
-    kind = _SECTIONS[name]
+def _section(name: str, values: Mapping[str, Any], given: Mapping[str, Any], source: str) -> Any:
+    """A section of `values` with what was `given` on the command line over it.
+
+    Raises:
+        ConfigError: names `source`, or the command line where the section could be used without what was given there.
+    """
     for key in values:
-        _known(key, [each.name for each in fields(kind)], f"{source}: {name}")
+        _known(key, _keys(name), f"{source}: {name}")
+    error = _error(name, {**values, **given})
+    if error is None:
+        return msgspec.convert({**values, **given}, _SECTIONS[name])
+    if not given or _error(name, values) == error:
+        raise ConfigError(f"{source}: {name}: {error}")
+    blamed = [key for key in given if key in error] or list(given)
+    raise ConfigError(f"command line: {', '.join(f'{name}.{key}' for key in blamed)}: {error}")
+
+
+def _error(name: str, values: Mapping[str, Any]) -> str | None:
+    """Why a section cannot be made of these values; None where it can."""
     try:
-        return msgspec.convert(dict(values), kind)
+        msgspec.convert(dict(values), _SECTIONS[name])
     except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"{source}: {name}: {error}") from None
+        return str(error)
+    return None
+
+
+def _keys(name: str) -> list[str]:
+    return [each.name for each in fields(_SECTIONS[name])]
 
 
 def _known(key: str, known: list[str], where: str) -> None:

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav import goselo
 from hiernav.nav.goselo import GoseloFrame
-from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner, swept_clearance
+from hiernav.nav.planners import CACHED_CELLS, GoseloPlanner, ShortestPathPlanner, VerifiedPlanner, swept_clearance
 
 FREE = map_with_pillars()
 PILLAR = map_with_pillars([(0.6, 0.0)])
@@ -76,6 +76,35 @@ def test_the_field_used_longest_ago_is_forgotten_first() -> None:
     planner.field(FREE, goals[2])
     assert planner.field(FREE, goals[0]) is first
     assert planner.field(FREE, goals[1]) is not second
+
+
+def test_fields_are_kept_up_to_a_number_of_cells_and_the_one_used_longest_ago_is_dropped() -> None:
+    planner, goals = ShortestPathPlanner(cached_cells=3 * 1600), np.array([[0.1 * k, 0.0] for k in range(5)])
+    small = map_with_pillars(half_size=(2.0, 2.0))
+    fields = [planner.field(small, goal) for goal in goals[:3]]
+    assert fields[0].cells == 1600 and planner.field(small, goals[0]) is fields[0]
+    planner.field(small, goals[3])
+    assert list(planner._fields.values())[:2] == [fields[2], fields[0]]
+    large = map_with_pillars(half_size=(5.0, 5.0))
+    field = planner.field(large, goals[4])
+    assert list(planner._fields.values()) == [field], "the newest is kept, however large"
+    assert planner.field(large, goals[4]) is field
+    planner.field(small, goals[0])
+    assert sum(kept.cells for kept in planner._fields.values()) <= 3 * 1600
+
+
+def test_as_many_large_maps_as_a_robot_may_meet_do_not_take_all_its_memory() -> None:
+    planner = ShortestPathPlanner()
+    for number in range(20):
+        planner.field(map_with_pillars(half_size=(10.0, 10.0)), np.array([0.1 * number, 0.0]))
+    assert sum(field.cells for field in planner._fields.values()) <= CACHED_CELLS == 500_000
+
+
+def test_the_fields_of_64_robots_side_by_side_are_all_kept() -> None:
+    planner, goal = ShortestPathPlanner(), np.array([1.5, 0.0])
+    maps = [map_with_pillars(half_size=(2.0, 2.0)) for _ in range(64)]
+    fields = [planner.field(each, goal) for each in maps]
+    assert all(planner.field(each, goal) is field for each, field in zip(maps, fields, strict=True))
 
 
 def test_where_there_is_no_path_or_no_position_the_row_is_nan_and_the_others_are_not() -> None:
