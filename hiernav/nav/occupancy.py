@@ -96,6 +96,18 @@ class OccupancyMap:
         high = (1.0 - s) * field[row + 1, col] + s * field[row + 1, col + 1]
         return np.where(inside, (1.0 - t) * low + t * high, 0.0)
 
+    def clearance_of(self, x: float, y: float) -> float:
+        """`clearance_at` for one point."""
+        if not self.holds(x, y):
+            return 0.0
+        field, (rows, cols) = self._padded_clearance.item, self.occupied.shape
+        u, v = (x - self.origin[0]) / self.resolution + 0.5, (y - self.origin[1]) / self.resolution + 0.5
+        col, row = min(int(u), cols), min(int(v), rows)
+        s, t = u - col, v - row
+        low = (1.0 - s) * field(row, col) + s * field(row, col + 1)
+        high = (1.0 - s) * field(row + 1, col) + s * field(row + 1, col + 1)
+        return (1.0 - t) * low + t * high
+
     def is_free(self, points: ArrayLike, radius: float) -> NDArray[np.bool_]:
         """Points (..., 2) [m] -> (...) bool: a disc of `radius` [m] there touches neither obstacle nor border."""
         clearance = self.clearance_at(points)

@@ -19,6 +19,7 @@ from hiernav.nav.frames import world_to_body
 from hiernav.nav.observation import ObservationLayout, clock_phase
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.recovery import Recovery
+from hiernav.nav.sweep import meets_map, sweep
 
 Skill = Callable[[np.ndarray], np.ndarray]
 """Observations (N, D) float32 -> actions (N, A) float32 in [-1, 1]."""
@@ -171,7 +172,7 @@ class WaypointOption:
     goal_radius: float = 0.3
     """A robot this close to its goal has reached it [m]."""
     sweep_radius: float = 0.1
-    """Radius with which the remaining plan is swept for `invalid` [m]."""
+    """Radius with which the way to the closest waypoint and the plan from there on are swept for `invalid` [m]."""
     max_reach: float = 10.0
     """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
@@ -191,7 +192,7 @@ class WaypointOption:
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
-        self._hit = np.zeros(self.num_rows, dtype=np.int64)  # last waypoint (from 1) that meets it, 0 if none does
+        self._hit = np.zeros(self.num_rows)  # where it meets it last, counted in vertices of the line; 0 if nowhere
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Forget plans, visits and counts of some rows (all by default), as at the start of an episode."""
@@ -295,8 +296,7 @@ class WaypointOption:
         occupancy: Sequence[OccupancyMap],
     ) -> np.ndarray:
         index, distance = path.nearest_vertex(position[:, None], path.polyline(self.start[pick], self.plan[pick]))
-        self._sweep(rows, occupancy)
-        blocked = self._hit[pick] >= np.maximum(index[:, 0], 1)
+        blocked = self._blocked(rows, position, np.maximum(index[:, 0], 1), occupancy)
         if np.count_nonzero(blocked):
             # on the map it was made for and where it was made, a blocked plan would only be proposed again
             moved = path.distances(position, self.start[pick]) > 0.05
@@ -311,16 +311,30 @@ class WaypointOption:
             started=self.started[pick],
         )
 
-    def _sweep(self, rows: np.ndarray, occupancy: Sequence[OccupancyMap]) -> None:
-        """Find the last waypoint that meets the map, where plan or map are new."""
+    def _blocked(
+        self, rows: np.ndarray, position: np.ndarray, index: np.ndarray, occupancy: Sequence[OccupancyMap]
+    ) -> np.ndarray:
+        """Whether the map meets the way to the closest waypoint, `index` (M,) from 1, or what comes behind it: (M,)."""
+        blocked = np.zeros(len(rows), dtype=bool)
         if not self.rule.invalid:
-            return
-        for row, now in zip(rows.tolist(), occupancy, strict=True):
+            return blocked
+        at_rows = zip(rows.tolist(), position.tolist(), index.tolist(), occupancy, strict=True)
+        for k, (row, where, closest, now) in enumerate(at_rows):
+            if not self.started[row]:
+                continue
             if self._swept[row] is not now:
-                met = np.flatnonzero(~now.is_free(self.plan[row], self.sweep_radius))
-                self._hit[row] = met[-1] + 1 if len(met) else 0
-                self._changed[row] = now is not self._planned_on[row]
-                self._swept[row] = now
+                self._sweep(row, now)
+            waypoint = self.plan[row, closest - 1].tolist()
+            blocked[k] = self._hit[row] >= closest or meets_map(now, where, waypoint, self.sweep_radius)
+        return blocked
+
+    def _sweep(self, row: int, now: OccupancyMap) -> None:
+        """Find where a plan meets a map last, if one of them is new."""
+        line = path.polyline(self.start[row : row + 1], self.plan[row : row + 1])
+        index, _, meets = sweep(line, now, self.sweep_radius)
+        self._hit[row] = (index * meets[0]).max()
+        self._changed[row] = now is not self._planned_on[row]
+        self._swept[row] = now
 
     def _replan(
         self, rows: np.ndarray, position: np.ndarray, goal: np.ndarray, occupancy: Sequence[OccupancyMap]

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from nav_planners import WatchedPlanner, map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hiernav.nav.occupancy import OccupancyMap, draw_boxes
 from hiernav.nav.option import ReplanRule, TerminationReason, WaypointOption
 from hiernav.nav.path import nearest_vertex, polyline
+from hiernav.nav.planners import StraightPlanner
 
 NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL = TerminationReason
 FREE = map_with_pillars()
@@ -254,6 +256,48 @@ def test_an_obstacle_on_the_remaining_plan_ends_it_and_one_on_the_used_part_does
     drive.option.sweep_radius = 0.04
     ahead = waypoint >= nearest_vertex(np.array([[[x, 0.0]]]), line)[0][0, 0]
     assert drive.at((x, 0.0)) == [INVALID if ahead else NONE]
+
+
+def map_with_wall(x: tuple[float, float], y: tuple[float, float]) -> OccupancyMap:
+    """A free map but for an upright box [m]."""
+    walled = map_with_pillars()
+    center, half = np.array([[sum(x), sum(y)]]) / 2, np.array([[x[1] - x[0], y[1] - y[0]]]) / 2
+    draw_boxes(walled.occupied, walled.origin, walled.resolution, center, half)
+    return walled
+
+
+def test_an_obstacle_between_the_robot_and_its_plan_ends_it() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    assert drive.at((0.3, 0.29)) == [NONE]
+    drive.map = map_with_wall((-3.0, 3.0), (0.1, 0.2))
+    drive.planner.silent = True
+    assert drive.at((0.3, 0.29)) == [INVALID]
+
+
+def test_an_obstacle_between_two_waypoints_ends_the_plan() -> None:
+    drive = Drive(goal=(2.9, 0.0))
+    drive.planner.plan = StraightPlanner(spacing=0.3).plan  # type: ignore[method-assign]
+    drive.at((0.0, 0.0))
+    assert drive.at((0.06, 0.0)) == [NONE]
+    drive.map = map_with_wall((0.4, 0.5), (-3.0, 3.0))
+    drive.option.sweep_radius = 0.05
+    assert drive.map.is_free(drive.option.plan[0], 0.05).all()
+    assert drive.at((0.06, 0.0)) == [INVALID]
+
+
+@pytest.mark.parametrize("turn", [0.5 * np.pi, 0.75 * np.pi, np.pi])
+def test_a_robot_that_touches_an_obstacle_keeps_the_plan_that_leads_away(turn: float) -> None:
+    """The map is another one at every step, as where obstacles move."""
+    away = 2.5 * np.array([np.cos(turn), np.sin(turn)])
+    drive = Drive(goal=away)
+    drive.map = map_with_pillars([(0.27, 0.0)])
+    assert not drive.map.is_free(np.zeros(2), 0.1)
+    assert drive.at((0.0, 0.0)) == [START]
+    for _ in range(5):
+        drive.map = map_with_pillars([(0.27, 0.0)])
+        assert drive.at((0.0, 0.0)) == [NONE]
+    assert drive.at(0.06 * away / 2.5) == [NONE]
 
 
 def test_a_plan_that_is_freed_again_goes_on() -> None:
