@@ -205,8 +205,12 @@ class WaypointOption:
             self.visits[row] = None
 
     def drop(self, rows: np.ndarray | slice | None = None) -> None:
-        """Give up the plans of some rows without forgetting the episode, as when the goal has changed."""
+        """Give up the plans of some rows without forgetting the episode, as when the goal has changed.
+
+        They hold their position until another plan comes.
+        """
         rows = slice(None) if rows is None else rows
+        self.plan[rows], self.start[rows] = np.nan, np.nan
         self.started[rows] = self.waiting[rows] = self._adopted[rows] = False
 
     def adopt(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> bool:

@@ -117,6 +117,22 @@ def test_after_a_change_of_goal_the_plan_is_dropped_and_the_episode_kept() -> No
     assert np.isnan(drive.planner.queries[-1].previous).all(), "a plan to another goal is no plan to agree with"
 
 
+@pytest.mark.parametrize("answer", ["refused", "later"])
+def test_a_plan_that_was_dropped_is_not_followed_whatever_the_planner_says(answer: str) -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.0, 1.0))
+    kept = drive.option.plan[1].copy()
+    drive.option.drop(np.array([0]))
+    drive.planner.silent = True
+    if answer == "later":
+        drive.planner.plan = lambda query: None  # type: ignore[method-assign]
+    for x in (0.1, 0.11):
+        step = drive.option.step(np.array([[x, 0.0], [0.1, 1.0]]), drive.goal, [FREE] * 2)
+        assert_allclose(step.plan[0], np.broadcast_to([0.1, 0.0], (10, 2)))
+        assert_array_equal(step.plan[1], kept)
+    assert drive.option.started.tolist() == [False, True]
+
+
 def test_with_a_period_plans_are_made_every_so_many_steps() -> None:
     drive = Drive(rule=ReplanRule(period=4))
     reasons = [drive.at((0.0, 3.0 * step / 13))[0] for step in range(13)]
