@@ -187,7 +187,7 @@ class WaypointOption:
         self.counts = np.zeros((self.num_rows, len(TerminationReason)), dtype=np.int64)
         self.refused = np.zeros(self.num_rows, dtype=np.int64)
         self.waiting = np.zeros(self.num_rows, dtype=bool)
-        """Whether a plan has been asked for that is to be brought by `adopt`."""
+        """Whether another plan is wanted, whatever the rule says: asked for at every step until one has come."""
         self._adopted = np.zeros(self.num_rows, dtype=bool)
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
@@ -364,7 +364,7 @@ class WaypointOption:
                 if proposed.shape != plan[known].shape:
                     raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
                 plan[known] = proposed
-        self.waiting[rows] = later
+        self.waiting[rows[later]] = True
         # not "> max_reach", so that NaN is refused too
         good = (np.abs(plan - position[:, None]) <= self.max_reach).all(axis=(1, 2))
         self.refused[rows[~good & ~later]] += 1
@@ -373,6 +373,7 @@ class WaypointOption:
         for k in np.flatnonzero(good | hold).tolist():
             self._follow(int(rows[k]), plan[k], position[k], occupancy[k])
         self.started[rows[good]] = True
+        self.waiting[rows[good]] = False
         return good
 
     def _follow(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> None:

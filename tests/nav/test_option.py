@@ -241,6 +241,32 @@ def test_a_position_that_is_not_a_number_keeps_the_plan_and_is_not_shown_to_the_
     assert drive.at((0.1, 0.0), (0.1, 0.0)) == [NONE, NONE], "a reading was missed, the plan still holds"
 
 
+def test_a_plan_that_is_wanted_is_asked_for_until_it_comes() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    drive.option.waiting[0] = drive.planner.silent = True
+    assert [drive.at((0.1, 0.0)) for _ in range(3)] == [[NONE]] * 3
+    assert len(drive.planner.queries) == 4 and drive.option.refused[0] == 3
+    drive.planner.silent = False
+    drive.at((0.1, 0.0))
+    assert_allclose(drive.option.start[0], [0.1, 0.0])
+    assert not drive.option.waiting[0]
+    drive.at((0.1, 0.0))
+    assert len(drive.planner.queries) == 5
+
+
+def test_a_missed_reading_does_not_end_the_wait_for_a_plan() -> None:
+    drive = Drive(num_rows=2)
+    drive.at((0.0, 0.0), (0.0, 1.0))
+    drive.planner.plan = lambda query: None  # type: ignore[method-assign]
+    drive.at((0.6, 0.0), (0.0, 1.0))
+    assert drive.option.waiting.tolist() == [True, False]
+    drive.at((np.nan, np.nan), (np.nan, np.nan))
+    assert drive.option.waiting.tolist() == [True, False]
+    assert drive.option.adopt(0, drive.option.plan[0] + 0.6, np.array([0.6, 0.0]), FREE)
+    assert not drive.option.waiting.any()
+
+
 def test_one_lost_robot_does_not_keep_the_others_from_planning() -> None:
     drive = Drive(num_rows=2)
     assert drive.at((np.nan, 0.0), (0.0, 0.0)) == [START, START]
