@@ -22,9 +22,9 @@ class PhysicsDiverged(RuntimeError):
 class NavigationEnv(EnvBase):
     """N robots following plans; batch size (N,).
 
-    Beside `observation`, `reward`, `done`, `terminated` and `truncated` a step holds, for logging: `terms` (N, 7)
-    unweighted reward terms in the order of `TERMS`, `reason` (N, 1) why the option ended, `reached` and `collided`
-    (N, 1), and `episode_steps` (N, 1).
+    Beside `observation`, `reward`, `done`, `terminated` and `truncated` a step holds, for logging: `terms`
+    (N, len(TERMS)) unweighted reward terms in the order of `TERMS`, `reason` (N, 1) why the option ended, `reached`
+    and `collided` (N, 1), and `episode_steps` (N, 1).
 
     A step raises `PhysicsDiverged` if a simulation's physics is no longer finite afterwards: nothing is to be learnt
     from a broken robot.
