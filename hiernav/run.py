@@ -8,11 +8,12 @@
     summary.json      outcome
 
 A checkpoint knows how long both logs were when it was written; resuming cuts off what came later, so that a resumed
-run leaves the same files as an uninterrupted one.
+run leaves the same files as an uninterrupted one. Checkpoints, and what they speak of, outlive a power failure.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -110,11 +111,15 @@ class Run:
             if self._writer is not None:
                 self._writer.flush()
             lengths = {key: log.stat().st_size for key, log in logs.items() if log.exists()}
+            for log in logs.values():
+                if log.exists():
+                    sync(log)
             buffer = io.BytesIO()
             torch.save({**state, **lengths}, buffer)
             folder = self.path / stage
             folder.mkdir(exist_ok=True)
             write_atomically(folder / "checkpoint.pt", buffer.getvalue())
+            sync(self.path)
 
     def load(self, stage: str, rewind: bool = False) -> dict[str, Any] | None:
         """A stage's checkpoint, or None; `rewind` cuts off logs that are newer than every stage's checkpoint.
@@ -216,7 +221,10 @@ def _read_checkpoint(file: Path) -> dict[str, Any]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that readers and crashes see the old or the new one, never half of it."""
+    """Write a file so that readers and crashes see the old or the new one, never half of it.
+
+    Once this has returned it is the new one, after a power failure too.
+    """
     temporary = path.with_name(path.name + ".part")
     try:
         with temporary.open("wb") as file:
@@ -224,5 +232,22 @@ def write_atomically(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's contents, or the names in a folder, are on disk.
+
+    Raises:
+        OSError: the disk cannot take them.
+    """
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    except OSError as error:
+        if error.errno != errno.EINVAL or not path.is_dir():  # some file systems know no such thing of folders
+            raise
+    finally:
+        os.close(opened)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from hiernav.nav.mirror import Mirror
+from hiernav.run import sync
 
 KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
@@ -18,14 +19,16 @@ KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("
 class Replay:
     """Transitions of one run.
 
-    Entries before the cursor of a checkpoint are on disk when it is written. What a crashed run wrote after it is
-    overwritten by the resumed one. (Once the buffer has wrapped, such entries can be sampled before they are
-    overwritten; a run is only reproduced to the bit while `total_steps <= buffer_size`.)
+    `flush` puts all entries on disk, where they outlive a power failure; a trainer calls it before each checkpoint.
+    What a crashed run wrote after the checkpoint is overwritten by the resumed one. (Once the buffer has wrapped, such
+    entries can be sampled before they are overwritten; a run is only reproduced to the bit while `total_steps <=
+    buffer_size`.)
 
     Raises OSError if the disk has no room for `size` transitions.
     """
 
     def __init__(self, folder: Path, size: int, observation: int, action: int, batch_size: int) -> None:
+        self._folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.fresh = not (folder / "meta.json").exists()
         """Whether its files were made just now, so that nothing is in them whatever a checkpoint says."""
@@ -68,6 +71,15 @@ class Replay:
         drawn = {key: column.index_select(0, rows) for key, column in self._columns.items()}
         following = {key[1]: drawn.pop(key) for key in KEYS if isinstance(key, tuple)}
         return TensorDict({**drawn, "next": TensorDict(following, [len(rows)])}, [len(rows)])
+
+    def flush(self) -> None:
+        """Wait until the files are on disk as they are now: the pages of the memory maps, their sizes and their names.
+
+        Raises:
+            OSError: the disk cannot take them.
+        """
+        for path in (*self._folder.rglob("*"), self._folder):
+            sync(path)
 
     def state_dict(self) -> dict[str, int]:
         return {"cursor": int(self._buffer.writer.state_dict()["_cursor"]), "length": len(self)}

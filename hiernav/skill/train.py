@@ -1,7 +1,9 @@
 """Training of the skill: batches from torchrl's collectors, a replay buffer on disk, and the learner.
 
 The run is cut into segments of `segment_frames`. Each one starts from freshly drawn episodes and ends with a
-checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved.
+checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved. Two
+things end that: a replay buffer that has wrapped (`Replay`), and a worker that has died, whose successors' worlds are
+not those that a resumed run draws for it.
 """
 
 from __future__ import annotations
@@ -349,6 +351,8 @@ class SkillTrainer:
         self._plans = self._plan_counts()  # those of the evaluation are not the training's
 
     def _save(self) -> None:
+        with self.run.writing():
+            self.replay.flush()  # a checkpoint that outlives a power failure must not speak of rows that do not
         self.run.save(
             "skill",
             {

@@ -158,6 +158,45 @@ def test_the_replay_takes_its_place_on_disk_before_training_begins(tmp_path):
     assert all(file.stat().st_blocks * 512 >= file.stat().st_size for file in files)
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs /proc")
+def test_what_a_checkpoint_speaks_of_is_on_disk_before_it_and_its_name_after_it(tmp_path, monkeypatch):
+    config = tiny_run.config(tmp_path / "run")
+    trainer, done = SkillTrainer(config, Run.create(config)), []
+    trainer.run.log("skill", 0, {"reach_rate": 0.0})
+    fsync, replace = os.fsync, os.replace
+
+    def synced(file: int) -> None:
+        fsync(file)
+        done.append(Path(os.readlink(f"/proc/self/fd/{file}")))
+
+    def renamed(source: Path, target: Path) -> None:
+        replace(source, target)
+        done.append(Path(target))
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    trainer._save()
+    skill = trainer.run.path / "skill"
+    before, after = (done[part] for k in [done.index(skill / "checkpoint.pt")] for part in (slice(k), slice(k, None)))
+    pages = set((skill / "replay").rglob("*.memmap"))
+    assert len(pages) == len(replay_module.KEYS) and pages < set(before)
+    assert {skill / "replay", skill / "replay" / "meta.json", trainer.run.path / "metrics.jsonl"} < set(before)
+    assert {skill, trainer.run.path} <= set(after)
+
+
+def test_a_disk_that_cannot_take_the_replay_ends_training_before_the_checkpoint(tmp_path, monkeypatch):
+    config = tiny_run.config(tmp_path / "run")
+    trainer = SkillTrainer(config, Run.create(config))
+
+    def broken(path: Path) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(replay_module, "sync", broken)
+    with pytest.raises(RunError, match=r"cannot be written to \(Input/output error\)"):
+        trainer._save()
+    assert not (trainer.run.path / "skill" / "checkpoint.pt").exists()
+
+
 def test_a_disk_without_room_for_the_replay_is_reported_at_once(tmp_path, monkeypatch):
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
