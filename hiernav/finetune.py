@@ -53,26 +53,30 @@ def begin_fine_tuning(config: TrainConfig, source: str | Path) -> Run:
     """A new run folder whose planner starts from the source's weights and whose skill is the source's.
 
     Raises:
-        RunError: the folder holds a run already, or the source's networks do not fit this version.
+        RunError: the folder is not empty or cannot be written to, or the source's networks do not fit this version.
+            There is no run folder then.
     """
     from hiernav.planner.train import PlannerTrainer
 
     source = Path(source)
     planner, skill = _run_states(source) if _is_run(source) else _bundle_states(load_bundle(source))
-    run = Run.create(config)
-    trainer = PlannerTrainer(config, run)
-    expected = trainer.network.state_dict()
-    for name, values in planner.items():
-        if name not in expected or expected[name].shape != values.shape:
-            wanted = "x".join(map(str, expected[name].shape)) if name in expected else "no such layer"
-            raise RunError(
-                f"{source}: the planner's {name} is {'x'.join(map(str, values.shape))}, {wanted} in this hiernav: "
-                "train a planner anew"
+
+    def begin(run: Run) -> None:
+        trainer = PlannerTrainer(config, run)
+        expected, missing = trainer.network.state_dict(), "no such layer"
+        for name in dict.fromkeys((*planner, *expected)):
+            found, wanted = (
+                "x".join(map(str, layers[name].shape)) if name in layers else missing for layers in (planner, expected)
             )
-    trainer.network.load_state_dict(planner)
-    trainer.save()
-    run.save("skill", skill)
-    return run
+            if found != wanted:
+                raise RunError(
+                    f"{source}: the planner's {name} is {found}, {wanted} in this hiernav: train a planner anew"
+                )
+        trainer.network.load_state_dict(planner)
+        trainer.save()
+        run.save("skill", skill)
+
+    return Run.create(config, begin)
 
 
 def _is_run(path: Path) -> bool:
@@ -83,7 +87,8 @@ def _source_config(path: Path) -> TrainConfig:
     if _is_run(path):
         return Run.open(path).config
     config, bundle = open_policies(path).config, load_bundle(path)
-    hidden = tuple(len(value) for name, value in sorted(_actor(bundle).items()) if _is_hidden(name))
+    layers = {int(name.split(".")[2]): value for name, value in _actor(bundle).items() if _is_hidden(name)}
+    hidden = tuple(len(layers[number]) for number in sorted(layers))
     return msgspec.structs.replace(config, skill=msgspec.structs.replace(config.skill, hidden=hidden))
 
 

@@ -17,8 +17,9 @@ import errno
 import json
 import math
 import os
+import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -52,18 +53,29 @@ class Run:
         self._began: dict[str, float] = {}
 
     @classmethod
-    def create(cls, config: TrainConfig) -> Run:
+    def create(cls, config: TrainConfig, begin: Callable[[Run], None] | None = None) -> Run:
         """Make a new run folder.
 
+        Args:
+            begin: saves the checkpoints that training starts from. The folder comes into being with all of them: what
+                is killed or fails before leaves none that could be resumed.
+
         Raises:
-            RunError: the folder holds a run already.
+            RunError: the folder holds a run already, or there is a `begin` and it holds anything; or it cannot be
+                written to.
         """
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{config.robot}-{config.seed}"
         path = Path(config.run_dir) if config.run_dir else Path("runs") / name
         if (path / "config.yaml").exists():
             raise RunError(f"{path} holds a run already: go on with --resume {path}, or choose another run_dir")
+        if begin is not None:
+            if path.exists() and next(path.iterdir(), None) is not None:
+                raise RunError(f"{path} is not empty: choose another run_dir")
+            _create_begun(path, config, begin)
+            return cls(path, config)
         path.mkdir(parents=True, exist_ok=True)
         write_atomically(path / "config.yaml", dump_config(config).encode())
+        sync(path.parent)
         return cls(path, config)
 
     @classmethod
@@ -180,6 +192,25 @@ class Run:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None]) -> None:
+    """Fill a folder beside `path`, and give it that name once it is whole."""
+    beside = path.with_name(path.name + ".part")
+    try:
+        shutil.rmtree(beside, ignore_errors=True)  # of a process that was killed here
+        beside.mkdir(parents=True)
+        begin(Run(beside, config))
+        write_atomically(beside / "config.yaml", dump_config(config).encode())
+        beside.rename(path)
+        sync(path.parent)
+    except (OSError, RunError) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(cause, OSError):
+            raise
+        raise RunError(f"{path} cannot be written to ({cause.strerror or cause}): there is no run yet") from cause
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def spent_seconds(folder: Path, stage: str) -> float:

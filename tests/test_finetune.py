@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,11 +18,13 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 
 from hiernav import cli  # noqa: E402
 from hiernav.config import load_config  # noqa: E402
-from hiernav.export import export_run  # noqa: E402
-from hiernav.finetune import fine_tuning_config  # noqa: E402
+from hiernav.export import export_run, write_bundle  # noqa: E402
+from hiernav.finetune import begin_fine_tuning, fine_tuning_config  # noqa: E402
 from hiernav.nav.bundle import load_bundle  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
+from hiernav.planner.network import make_network  # noqa: E402
 from hiernav.run import Run  # noqa: E402
+from hiernav.skill.train import make_learner  # noqa: E402
 
 pytestmark = pytest.mark.train
 OTHER = "pillar(1.5,1.5,3)"
@@ -119,5 +126,83 @@ def test_a_planner_of_other_layers_is_refused(tmp_path: Path, able_run: Path, ca
     other = Run.open(copy)
     other.save("planner", {**state, "network": {**state["network"], "head.weight": torch.zeros(3, 3)}})
     other.save("skill", run.load("skill"))
+    for again in range(2):
+        assert cli.main(command(copy, tmp_path / "tuned")) == 2, again
+        assert "head.weight is 3x3" in capsys.readouterr().err
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["copy"]
+
+
+def test_a_planner_that_lacks_a_layer_is_refused(tmp_path: Path, able_run: Path, capsys):
+    copy = Path(shutil.copytree(able_run, tmp_path / "copy"))
+    state = Run.open(copy).load("planner")
+    state["network"].pop("head.weight")
+    Run.open(copy).save("planner", state)
     assert cli.main(command(copy, tmp_path / "tuned")) == 2
-    assert "head.weight is 3x3" in capsys.readouterr().err
+    assert "head.weight is no such layer" in capsys.readouterr().err
+    assert not (tmp_path / "tuned").exists()
+
+
+@pytest.mark.parametrize("at", ["planner/checkpoint.pt", "skill/checkpoint.pt", "config.yaml"])
+def test_a_start_that_is_killed_leaves_no_run_and_the_same_command_begins_anew(able_run: Path, tmp_path: Path, at: str):
+    tuned = tmp_path / "tuned"
+    code = f"""
+import os, signal
+from hiernav import cli
+replace = os.replace
+def kill(source, target):
+    if str(target).endswith({at!r}):
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(source, target)
+os.replace = kill
+cli.main({command(able_run, tuned)!r})
+"""
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert not tuned.exists()
+    assert cli.main(["train", "--stage", "planner", "--resume", str(tuned)]) == 2
+    assert cli.main(command(able_run, tuned, "planner.learning_rate=1e-9")) == 0
+    assert os.listdir(tmp_path) == ["tuned"]
+    before = Run.open(able_run).load("planner")["network"]
+    for name, value in Run.open(tuned).load("planner")["network"].items():
+        torch.testing.assert_close(value, before[name], rtol=1e-4, atol=1e-5)
+
+
+def test_a_fine_tuning_does_not_go_on_from_random_weights_where_its_own_are_gone(
+    able_run: Path, tmp_path: Path, capsys
+):
+    tuned = tmp_path / "tuned"
+    begin_fine_tuning(fine_tuning_config(able_run, [f"run_dir={tuned}"]), able_run).close()
+    (tuned / "planner" / "checkpoint.pt").unlink()
+    assert cli.main(["train", "--stage", "planner", "--resume", str(tuned)]) == 2
+    assert "planner/checkpoint.pt is missing: restore it, or begin anew with --from" in capsys.readouterr().err
+
+
+def test_a_disk_without_room_for_the_start_is_one_line_and_leaves_no_run(
+    able_run: Path, tmp_path: Path, capsys, monkeypatch
+):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("hiernav.run.os.replace", full)
+    assert cli.main(command(able_run, tmp_path / "tuned")) == 2
+    told = capsys.readouterr().err
+    assert f"{tmp_path / 'tuned'} cannot be written to (No space left on device): there is no run yet" in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_something_in_it_is_not_taken_for_a_fine_tuning(able_run: Path, tmp_path: Path, capsys):
+    (tmp_path / "tuned").mkdir()
+    (tmp_path / "tuned" / "notes.txt").write_text("mine")
+    assert cli.main(command(able_run, tmp_path / "tuned")) == 2
+    assert "is not empty: choose another run_dir" in capsys.readouterr().err
+    assert os.listdir(tmp_path / "tuned") == ["notes.txt"]
+
+
+def test_layers_of_a_bundle_are_told_in_their_order(tmp_path: Path):
+    widths = [12, 11, 10, 9, 8, 7, 6]
+    (tmp_path / "bundle").mkdir()
+    config = tiny_run.config(tmp_path / "run", f"skill.hidden={widths}")
+    planner = config.planner
+    network = make_network(planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses)
+    write_bundle(tmp_path / "bundle", config, network, make_learner(config).actor, {})
+    assert list(fine_tuning_config(tmp_path / "bundle", []).skill.hidden) == widths

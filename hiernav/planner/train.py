@@ -32,7 +32,7 @@ from hiernav.planner.network import (
     make_network,
 )
 from hiernav.planner.store import DatasetError, read_dataset, read_manifest
-from hiernav.run import Run, TrainingDiverged
+from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
 
@@ -88,9 +88,18 @@ class PlannerTrainer:
         self._given = False  # whether training starts from weights that were trained elsewhere
 
     def resume(self) -> int | None:
-        """Go back to the last checkpoint; its number of epochs, or None if there is none."""
+        """Go back to the last checkpoint; its number of epochs, or None if there is none.
+
+        Raises:
+            RunError: this is a fine-tuning, and the weights that it started from are gone.
+        """
         state = self.run.load("planner", rewind=True)
         if state is None:
+            if (self.run.load("skill") or {}).get("imported"):
+                raise RunError(
+                    f"{self.run.path} fine-tunes a planner, and its planner/checkpoint.pt is missing: restore it, or "
+                    "begin anew with --from"
+                )
             return None
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])

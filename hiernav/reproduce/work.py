@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -182,9 +183,8 @@ def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
     assert cell.world is not None
     source, about = _policies(cell, places)
     folder, _ = training_of(cell, places)
-    if not (folder / "planner" / "checkpoint.pt").exists():
-        # begun and not even saved: there is nothing to go on with
-        (folder / "config.yaml").unlink(missing_ok=True)
+    if not (folder / "skill" / "checkpoint.pt").exists():
+        shutil.rmtree(folder, ignore_errors=True)  # begun by an older version and killed: nothing to go on with
         overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
     _train_run(folder, "planner", _noting_commit(folder, places, report))
