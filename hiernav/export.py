@@ -16,7 +16,6 @@ from hiernav import __version__
 from hiernav.config import TrainConfig
 from hiernav.nav import goselo
 from hiernav.nav.bundle import (
-    MANIFEST,
     PLANNER,
     SKILL,
     GoseloSpec,
@@ -28,6 +27,7 @@ from hiernav.nav.bundle import (
     SkillSpec,
     TensorSpec,
     file_sha256,
+    is_bundle,
     load_bundle,
     write_golden,
     write_manifest,
@@ -62,14 +62,15 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
 
     Args:
         run_path: run folder with a finished planner and skill.
-        out: bundle folder; it is replaced as a whole, and only by a bundle that has been loaded and checked.
+        out: bundle folder; it is replaced as a whole, and only by a bundle that has been loaded and checked. What
+            fails or is interrupted leaves the old one in its place.
 
     Raises:
-        RunError: the run has no trained planner or skill, or `out` is in use for something else.
+        RunError: the run has no trained planner or skill, or `out` holds anything but a bundle.
+        OSError: the bundle cannot be written.
     """
     run, out = Run.open(run_path), Path(out)
-    if out.exists() and not (out / MANIFEST).exists() and (out.is_file() or any(out.iterdir())):
-        raise RunError(f"{out} is not a bundle and not empty: choose another folder to export to")
+    _require_replaceable(out)
     if run.config.skill.preset == "baseline":
         raise RunError(f"{run.path} holds a baseline, which follows no plan: a bundle needs a planner")
     states = {stage: run.load(stage) for stage in ("planner", "skill")}
@@ -83,10 +84,29 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
         folder = Path(temporary) / "bundle"
         folder.mkdir()
         write_bundle(folder, run.config, network, actor, _provenance(run, states))
-        if out.exists():
-            out.rename(Path(temporary) / "replaced")
-        folder.rename(out)
+        _require_replaceable(out)  # again: an export takes long enough for somebody to put a file there
+        _replace(out, folder, Path(temporary) / "replaced")
     return out
+
+
+def _require_replaceable(out: Path) -> None:
+    if out.exists() and not is_bundle(out) and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out} is not a bundle and not empty: choose another folder to export to")
+
+
+def _replace(out: Path, folder: Path, replaced: Path) -> None:
+    """Put `folder` in the place of `out`, which goes to `replaced`, or comes back whatever stops this on the way.
+
+    Where the process is killed between the two, the old one stays in `replaced`.
+    """
+    try:
+        if out.exists():
+            out.rename(replaced)
+        folder.rename(out)
+    except BaseException:  # an interrupt as well
+        if replaced.exists() and not out.exists():
+            replaced.rename(out)
+        raise
 
 
 def write_bundle(

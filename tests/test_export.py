@@ -202,7 +202,7 @@ def test_a_bundle_of_a_newer_format_is_refused_with_what_to_do(bundle):
 def test_a_bundle_is_replaced_as_a_whole_or_stays(able_run, able_bundle, bundle, monkeypatch):
     before = {file.name: file.read_bytes() for file in bundle.iterdir()}
     edit_manifest(bundle, format_version=2)  # of no more use
-    (bundle / "notes.txt").write_text("of the old one")
+    (bundle / "golden.npz").write_bytes(b"damaged")
     old = {file.name: file.read_bytes() for file in bundle.iterdir()}
 
     def write(folder: Path, *_: object) -> None:
@@ -235,6 +235,56 @@ def test_a_folder_that_is_no_bundle_is_not_replaced(able_run, tmp_path):
         export_run(able_run, precious / "chapter.tex")
     assert (precious / "chapter.tex").read_text() == "two years of work"
     assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
+
+
+@pytest.mark.parametrize(
+    ("manifest", "other"),
+    [
+        ('{"name": "My app", "display": "standalone"}', "src/thesis.txt"),
+        ('{"name": "My app", "display": "standalone"}', None),
+        ('{"format_version": 1}', "thesis.txt"),
+        ('{"format_version": 1}', "planner.onnx/thesis.txt"),
+        ("{", None),
+    ],
+)
+def test_only_a_bundle_is_replaced_whatever_else_has_a_manifest(able_run, tmp_path, manifest, other):
+    folder = tmp_path / "webapp"
+    folder.mkdir()
+    (folder / MANIFEST).write_text(manifest)
+    if other:
+        (folder / other).parent.mkdir(exist_ok=True)
+        (folder / other).write_text("two years of work")
+    with pytest.raises(RunError, match="is not a bundle and not empty: choose another folder") as error:
+        export_run(able_run, folder)
+    assert "\n" not in str(error.value)
+    assert (folder / MANIFEST).read_text() == manifest
+    assert other is None or (folder / other).read_text() == "two years of work"
+    assert [path.name for path in tmp_path.iterdir()] == ["webapp"]
+
+
+@pytest.mark.parametrize("stop", [OSError("disk"), KeyboardInterrupt()])
+@pytest.mark.parametrize("after", [False, True])
+def test_the_old_bundle_comes_back_when_the_exchange_is_stopped(
+    able_run, able_bundle, bundle, monkeypatch, stop, after
+):
+    old = {file.name: file.read_bytes() for file in bundle.iterdir()}
+    rename = Path.rename
+
+    def stopped(source: Path, target: Path) -> Path:
+        """Fails before the new bundle is in its place, or is interrupted after the old one has left it."""
+        if source.name == "bundle" and source.parent != bundle.parent and not after:
+            raise stop
+        moved = rename(source, target)
+        if source == bundle and after:
+            raise stop
+        return moved
+
+    monkeypatch.setattr(export, "write_bundle", lambda folder, *_: (folder / "skill.onnx").write_text("new"))
+    monkeypatch.setattr(Path, "rename", stopped)
+    with pytest.raises(type(stop)):
+        export_run(able_run, bundle)
+    assert {file.name: file.read_bytes() for file in bundle.iterdir()} == old
+    assert [path.name for path in bundle.parent.iterdir()] == ["bundle"]
 
 
 @pytest.mark.parametrize("stage", ["planner", "skill"])

@@ -250,6 +250,20 @@ def load_bundle(path: str | Path) -> Bundle:
     return Bundle(manifest, contents[PLANNER], contents[SKILL], _decode_golden(contents[GOLDEN]))
 
 
+def is_bundle(path: str | Path) -> bool:
+    """Whether a folder holds the files of a bundle, whole or damaged and of any version, and nothing else."""
+    folder = Path(path)
+    if not folder.is_dir() or any(
+        entry.name not in (*HASHED_FILES, MANIFEST) or not entry.is_file() for entry in folder.iterdir()
+    ):
+        return False
+    try:
+        msgspec.json.decode(_read(folder, MANIFEST, MAX_MANIFEST_BYTES), type=_Version)
+    except (BundleError, msgspec.DecodeError, UnicodeDecodeError):
+        return False
+    return True
+
+
 def file_sha256(path: str | Path) -> str:
     """SHA-256 of a file, as the manifest keeps it for the robot's model."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
