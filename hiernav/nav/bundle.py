@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,7 +27,8 @@ HASHED_FILES = (PLANNER, SKILL, GOLDEN)
 MAX_FILE_BYTES = 50_000_000
 MAX_MANIFEST_BYTES = 1_000_000
 GOLDEN_NAMES = ("observation", "action", "image", "distance", "waypoints", "scores")
-"""Arrays of `golden.npz`: skill input and output, planner inputs and outputs."""
+"""Arrays of `golden.npz`: skill input and output, planner inputs and outputs; float32, and uint8 the image."""
+_GOLDEN_RANKS = {"observation": 2, "action": 2, "image": 4, "distance": 1, "waypoints": 4, "scores": 2}
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -144,6 +146,8 @@ class Bundle:
     skill: bytes
     """Serialised ONNX model."""
     golden: Mapping[str, np.ndarray]
+    """observation (N, D), action (N, A), image (M, C, 64, 64) uint8, distance (M,) [m], waypoints (M, H, K, 2) [m] and
+    scores (M, H); float32."""
 
     @property
     def layout(self) -> ObservationLayout:
@@ -231,8 +235,8 @@ def load_bundle(path: str | Path) -> Bundle:
     """Read and verify a bundle.
 
     Raises:
-        BundleError: a file is missing, too large or altered, the manifest is malformed or made by a newer version, or a
-            model has external data or custom operators.
+        BundleError: a file is missing, too large or altered, the manifest is malformed or made by a newer version, a
+            model has external data or custom operators, or the golden arrays are damaged or of other types or ranks.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -320,16 +324,58 @@ def _check_model(data: bytes, name: str) -> OnnxFacts:
 
 def _decode_golden(data: bytes) -> dict[str, np.ndarray]:
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            inflated = sum(entry.file_size for entry in archive.infolist())
-        if inflated > MAX_FILE_BYTES:
-            raise BundleError(f"{GOLDEN}: inflates to more than {MAX_FILE_BYTES / 1e6:g} MB")
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            golden = {name: arrays[name] for name in arrays.files}
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
-        if isinstance(error, BundleError):
-            raise
-        raise BundleError(f"{GOLDEN}: {error}") from None
-    if set(golden) != set(GOLDEN_NAMES):
-        raise BundleError(f"{GOLDEN}: holds {', '.join(sorted(golden))}; it must hold {', '.join(GOLDEN_NAMES)}")
+        golden = _read_arrays(data)
+    except BundleError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy's headers fail in any of a dozen ways
+        reason = " ".join(str(error).split())[:200]
+        raise BundleError(f"{GOLDEN}: damaged ({reason or type(error).__name__})") from None
+    for names in (("observation", "action"), ("image", "distance", "waypoints", "scores")):
+        rows = [len(golden[name]) for name in names]
+        if len(set(rows)) != 1:
+            raise BundleError(f"{GOLDEN}: {', '.join(names)} have {', '.join(map(str, rows))} rows, expected as many")
     return golden
+
+
+def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """The arrays of a golden file; memory is taken only for bytes that are there."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+        if sum(entry.file_size for entry in entries) > MAX_FILE_BYTES:
+            raise BundleError(f"{GOLDEN}: inflates to more than {MAX_FILE_BYTES / 1e6:g} MB")
+        names = sorted(entry.filename for entry in entries)
+        if names != sorted(f"{name}.npy" for name in GOLDEN_NAMES):
+            shown = ", ".join(name.removesuffix(".npy") for name in names[: 2 * len(GOLDEN_NAMES)])
+            raise BundleError(f"{GOLDEN}: holds {shown}; it must hold {', '.join(GOLDEN_NAMES)}")
+        arrays, left = {}, MAX_FILE_BYTES
+        for name in GOLDEN_NAMES:
+            entry = archive.getinfo(f"{name}.npy")
+            # others are inflated without a limit
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise BundleError(f"{GOLDEN}: {name} is compressed by method {entry.compress_type}, expected deflate")
+            with archive.open(entry) as member:
+                array = member.read(left + 1)
+            left -= len(array)
+            if left < 0:
+                raise BundleError(f"{GOLDEN}: inflates to more than {MAX_FILE_BYTES / 1e6:g} MB")
+            arrays[name] = _read_array(name, array)
+    return arrays
+
+
+def _read_array(name: str, data: bytes) -> np.ndarray:
+    """An array of the golden file, whose header must be that of `GOLDEN_NAMES` and fit the bytes after it."""
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise BundleError(f"{GOLDEN}: {name} is of npy version {version}, expected 1.0 or 2.0")
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran_order, dtype = read_header(file)
+    expected, rank = np.dtype(np.uint8 if name == "image" else np.float32), _GOLDEN_RANKS[name]
+    if dtype != expected:
+        raise BundleError(f"{GOLDEN}: {name} is {str(dtype)[:40]}, expected {expected}")
+    if len(shape) != rank or min(shape) < 1:
+        raise BundleError(f"{GOLDEN}: {name} has shape {str(shape)[:80]}, expected {rank} axes, none of them empty")
+    body = data[file.tell() :]
+    if math.prod(shape) * expected.itemsize != len(body):
+        raise BundleError(f"{GOLDEN}: {name} has shape {str(shape)[:80]}, which {len(body)} bytes do not fill")
+    return np.frombuffer(body, expected).reshape(shape, order="F" if fortran_order else "C").copy()

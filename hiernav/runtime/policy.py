@@ -70,10 +70,11 @@ class OnnxPlannerNetwork:
         self._session = _session(model, PLANNER)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         ranks = [len(each.shape) for each in (*inputs, *outputs)]
-        if ranks != [4, 1, 4, 2] or inputs[0].type not in _DTYPES or inputs[1].type != "tensor(float)":
+        others = {each.type for each in (*inputs[1:], *outputs)}
+        if ranks != [4, 1, 4, 2] or inputs[0].type not in _DTYPES or others != {"tensor(float)"}:
             raise BundleError(
                 f"{PLANNER}: {_signature(self._session)}; expected image (M, C, 64, 64) float or uint8 and "
-                "distance (M) float -> waypoints (M, H, K, 2), scores (M, H)"
+                "distance (M) float -> waypoints (M, H, K, 2) float, scores (M, H) float"
             )
         self.channels = _known(inputs[0], 1, PLANNER)
         self._image_dtype = _DTYPES[inputs[0].type]

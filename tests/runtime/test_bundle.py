@@ -3,6 +3,8 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import tracemalloc
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,6 +244,144 @@ def test_a_golden_file_without_all_its_arrays_is_refused(folder):
         b.load_bundle(folder)
     with pytest.raises(ValueError, match="golden arrays are"):
         b.write_golden(folder, {"observation": np.zeros(3)})
+
+
+def npy(header: str, body: bytes = b"", version: int = 1) -> bytes:
+    text = (header + "\n").encode("latin1")
+    return b"\x93NUMPY" + bytes([version, 0]) + len(text).to_bytes(2 if version == 1 else 4, "little") + text + body
+
+
+def header(shape: str, kind: str = "<f4") -> str:
+    return f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+
+
+def array_bytes(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def golden_zip(folder: Path, method: int = zipfile.ZIP_DEFLATED, **members: bytes) -> bytes:
+    """The golden file of a bundle, with some of its members replaced."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name, array in b.load_bundle(folder).golden.items():
+            archive.writestr(f"{name}.npy", members.get(name, array_bytes(array)))
+    return buffer.getvalue()
+
+
+def zip_field(data: bytes, offset: int, value: int) -> bytes:
+    """Set two bytes of every header of an archive, local and central; `offset` is that in a local one."""
+    changed = bytearray(data)
+    for signature, shift in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
+        at = data.find(signature)
+        while at >= 0:
+            changed[at + shift + offset : at + shift + offset + 2] = value.to_bytes(2, "little")
+            at = data.find(signature, at + 1)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(
+    ("action", "reason"),
+    [
+        (npy(header("(100000000000, 2)")), r"action has shape \(100000000000, 2\), which 0 bytes do not fill"),
+        (npy(header(f"({10**30}, 2)")), "do not fill"),
+        (npy(header("(4, 2)"), bytes(31)), "which 31 bytes do not fill"),
+        (npy(header("(4, 2)"), bytes(33)), "which 33 bytes do not fill"),
+        (npy(header("(-4, -2)"), bytes(32)), "expected 2 axes, none of them empty"),
+        (npy(header("(0, 2)")), "expected 2 axes, none of them empty"),
+        (npy(header("(4, 2)"), bytes(32), version=3), r"npy version \(3, 0\)"),
+        (npy("(" * 4), "damaged"),
+        (npy("(" * 9000), "damaged"),
+        (npy("\0"), "damaged"),
+        (npy(header("(4, 2)", "nonsense")), "damaged"),
+        (b"MZ this is no array", "damaged"),
+        (b"", "damaged"),
+        (array_bytes(np.float32(1)), "expected 2 axes"),
+        (array_bytes(np.zeros(4, np.float32)), "expected 2 axes"),
+        (array_bytes(np.zeros((4, 2), "U3")), "action is <U3, expected float32"),
+        (array_bytes(np.zeros((4, 2), np.complex64)), "action is complex64, expected float32"),
+        (array_bytes(np.zeros((4, 2))), "action is float64, expected float32"),
+        (array_bytes(np.zeros((4, 2), ">f4")), "action is >f4, expected float32"),
+        (array_bytes(np.zeros((3, 2), np.float32)), "observation, action have 4, 3 rows, expected as many"),
+    ],
+)
+def test_golden_arrays_are_of_the_type_the_rank_and_the_size_they_say(folder, action, reason):
+    replace_file(folder, b.GOLDEN, golden_zip(folder, action=action))
+    tracemalloc.start()
+    with pytest.raises(b.BundleError, match=f"golden.npz: .*{reason}") as error:
+        b.load_bundle(folder)
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
+
+
+def test_golden_arrays_stored_by_columns_are_read_as_they_were(folder):
+    before = b.load_bundle(folder).golden
+    b.write_golden(folder, {name: np.asfortranarray(array) for name, array in before.items()})
+    replace_file(folder, b.GOLDEN, (folder / b.GOLDEN).read_bytes())
+    for name, array in b.load_bundle(folder).golden.items():
+        np.testing.assert_array_equal(array, before[name])
+
+
+METHOD, FLAGS = 8, 6
+"""Offsets in a zip archive's headers."""
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "reason"),
+    [
+        (METHOD, 1, "compressed by method 1"),
+        (METHOD, 12, "compressed by method 12"),
+        (METHOD, 14, "compressed by method 14"),
+        (METHOD, 93, "compressed by method 93"),
+        (METHOD, 99, "compressed by method 99"),
+        (FLAGS, 1, "damaged .*encrypted"),
+    ],
+)
+def test_a_golden_file_that_is_packed_in_another_way_is_refused(folder, offset, value, reason):
+    replace_file(folder, b.GOLDEN, zip_field(golden_zip(folder), offset, value))
+    with pytest.raises(b.BundleError, match=f"golden.npz: .*{reason}"):
+        b.load_bundle(folder)
+
+
+def test_a_golden_file_of_which_a_member_comes_twice_is_refused(folder):
+    buffer = io.BytesIO(golden_zip(folder))
+    with zipfile.ZipFile(buffer, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("action.npy", array_bytes(np.zeros((4, 2), np.float32)))
+    replace_file(folder, b.GOLDEN, buffer.getvalue())
+    with pytest.raises(b.BundleError, match="it must hold"):
+        b.load_bundle(folder)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    method=st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]),
+    cut=shares,
+    whole=st.booleans(),
+    flips=st.lists(st.tuples(shares, st.integers(1, 255)), max_size=8),
+    noise=st.none() | st.binary(max_size=80),
+)
+def test_a_damaged_golden_file_is_read_or_refused_in_one_line(tmp_path_factory, method, cut, whole, flips, noise):
+    folder = tmp_path_factory.getbasetemp() / "fuzzed-golden"
+    if not folder.exists():
+        folder.mkdir()
+        write_bundle(folder)
+        (folder / "kept").write_bytes((folder / b.GOLDEN).read_bytes())
+    replace_file(folder, b.GOLDEN, (folder / "kept").read_bytes())
+    # flips hit the headers more often where the arrays are not much longer
+    image = array_bytes(np.zeros((3, 1, 1, 1), np.uint8))
+    members = {"image": image} | ({} if noise is None else {"action": array_bytes(np.zeros((4, 2), "f4"))[:10] + noise})
+    data = bytearray(golden_zip(folder, method, **members))
+    for at, flip in flips:
+        data[int(at * len(data))] ^= flip
+    replace_file(folder, b.GOLDEN, bytes(data if whole else data[: int(cut * len(data))]))
+    try:
+        golden = b.load_bundle(folder).golden
+    except b.BundleError as error:
+        assert str(error) and "\n" not in str(error)
+    else:
+        assert set(golden) == set(b.GOLDEN_NAMES)
 
 
 def test_a_folder_that_could_not_be_loaded_gets_no_manifest(tmp_path):

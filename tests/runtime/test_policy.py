@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from onnx import TensorProto, helper
 from small_bundle import CHANNELS, LAYOUT, model_bytes, planner_bytes, skill_bytes, value, write_bundle
@@ -133,3 +134,12 @@ def test_an_observation_list_longer_than_the_networks_input_is_refused(tmp_path)
     write_bundle(tmp_path, observation=(*layout, longer))
     with pytest.raises(b.BundleError, match="observation size: 5 in the network, 6 in the manifest"):
         load_policies(b.load_bundle(tmp_path))
+
+
+def test_a_planner_that_answers_in_another_type_is_refused():
+    model = onnx.load_from_string(planner_bytes())
+    model.graph.node[-1].output[0] = "means_of_all"
+    model.graph.node.append(helper.make_node("Cast", ["means_of_all"], ["scores"], to=TensorProto.STRING))
+    model.graph.output[1].type.tensor_type.elem_type = TensorProto.STRING
+    with pytest.raises(b.BundleError, match=r"planner.onnx: .*expected .*scores \(M, H\) float"):
+        OnnxPlannerNetwork(model.SerializeToString())
