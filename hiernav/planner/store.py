@@ -74,12 +74,18 @@ def write_dataset(
         on_progress: told the number of samples that are there.
 
     Raises:
-        DatasetError: the folder holds a data set of another kind, or a damaged one.
+        DatasetError: the folder holds a data set of another kind, one with more samples, or a damaged one.
         OSError: it cannot be written to.
     """
     folder = Path(folder)
     manifest = Manifest(FORMAT_VERSION, settings, seed, count, ())
     if (folder / MANIFEST).exists():
+        made = read_manifest(folder).made
+        if count < made:
+            raise DatasetError(
+                f"{folder} has {made:,} samples already, {count:,} are wanted: choose another folder, or train on the "
+                f"first {count:,} of these with planner.samples={count}"
+            )
         manifest = msgspec.structs.replace(_compatible(folder, read_manifest(folder), manifest), samples=count)
     elif folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise DatasetError(f"{folder} is not a data set and not empty: choose another folder")

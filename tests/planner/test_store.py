@@ -76,6 +76,16 @@ def test_a_data_set_can_be_made_larger(folder: Path):
     assert same(read_dataset(folder), make_samples(SETTINGS, 30, SEED))
 
 
+@pytest.mark.parametrize("count", [16, 19, 8])
+def test_samples_that_are_there_are_never_thrown_away(folder: Path, count: int):
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    with pytest.raises(DatasetError, match=f"has 20 samples already, {count} are wanted"):
+        write_dataset(folder, SETTINGS, count, SEED)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    assert same(read_dataset(folder, count), make_samples(SETTINGS, count, SEED))  # as the message says
+    assert write_dataset(folder, SETTINGS, 20, SEED).made == 20
+
+
 def test_samples_of_another_kind_are_not_mixed_in(folder: Path):
     with pytest.raises(DatasetError, match=r"radius = 0.1, not 0.2: choose another folder"):
         write_dataset(folder, replace(SETTINGS, radius=0.2), 20, SEED)
