@@ -44,6 +44,30 @@ def test_what_is_not_a_setting_is_refused_with_its_name(override, why):
     assert why in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("guard.slow_ttc=.nan", "command line: guard.slow_ttc: "),
+        ("guard.slow_tcc=1", "command line: guard: unknown setting 'slow_tcc'"),
+        ("driver.max_steps=many", "command line: driver.max_steps: Expected `int`"),
+    ],
+)
+def test_what_the_command_line_got_wrong_is_not_blamed_on_the_file(tmp_path: Path, override: str, says: str):
+    file = tmp_path / "s.yaml"
+    file.write_text("guard: {tilt_limit: 0.5}\n")
+    with pytest.raises(ConfigError) as refused:
+        load_settings(file, ["guard.slew_limit=0.3", override])
+    assert str(refused.value).startswith(says)
+
+
+def test_what_the_file_got_wrong_is_not_blamed_on_the_command_line(tmp_path: Path):
+    file = tmp_path / "s.yaml"
+    file.write_text("guard: {slow_ttc: -1}\n")
+    with pytest.raises(ConfigError, match=r"s\.yaml: guard: "):
+        load_settings(file, ["guard.slew_limit=0.3"])
+    assert load_settings(file, ["guard.slow_ttc=0.5"]).guard.slow_ttc == 0.5
+
+
 @pytest.mark.parametrize("text", ["- 1", "guard: 3", "guard: [1]", "nothing: {}", "guard: {low: x}"])
 def test_a_malformed_file_is_refused_with_its_name(tmp_path: Path, text: str):
     file = tmp_path / "s.yaml"
