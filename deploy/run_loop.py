@@ -28,11 +28,12 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -47,6 +48,7 @@ from hiernav.runtime.dry_run import print_report, report
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.faulty import FAULTS, FaultyRobot
 from hiernav.runtime.guard import Guard
+from hiernav.runtime.loop import noting_signals
 from hiernav.runtime.noise import EXACT
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
@@ -157,12 +159,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (runs/drive-TIME)")
     parser.add_argument("--record", type=Path, metavar="FILE", help="MCAP file with every tick (hiernav replay FILE)")
     parser.add_argument(
-        "--view", nargs="?", type=int, const=8080, metavar="PORT",
+        "--view", nargs="?", type=_port, const=8080, metavar="PORT",
         help="live page in the browser, for this machine alone (8080); stays ready for goals, until Ctrl-C",
     )  # fmt: skip
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary here too")
+    parser.add_argument("--json", metavar="FILE", help="write the summary here too; - for the screen, alone on it")
     return parser
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is no port, expected 0 to 65535")
+    return int(text)
 
 
 def _tell(arguments: argparse.Namespace) -> int:
@@ -175,12 +183,16 @@ def _dry_run(arguments: argparse.Namespace) -> int:
     spec = get_robot(arguments.robot)
     settings = _settings(arguments, spec)
     bundle = arguments.bundle or BUNDLES / spec.name
+    if arguments.json not in (None, "-"):
+        _require_writable(Path(arguments.json), "--json")
     with ExitStack() as stack:
         make = lambda: _process_robot(arguments, spec, settings, stack)  # noqa: E731
         found = report(lambda: _open_bundle(bundle, spec), make, settings)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
-    print_report(found)
+    print_report(found, _screen(arguments))
+    if arguments.json == "-":
+        print(json.dumps(found, indent=2))
+    elif arguments.json:
+        _save(Path(arguments.json), found)
     if found["bundle"].get("error"):
         return BAD_BUNDLE
     return FAULT if any("error" in part for part in found.values()) else OK
@@ -279,12 +291,17 @@ class Episodes:
             driver,
             rehearsal=0.0 if arguments.fast else settings.realtime.rehearsal,
         )
+        # before anything moves: after the drive it would be too late
+        self.out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
+        self.files = [self.out / "summary.json"]
+        _require_writable(self.files[0], "--out")
+        if arguments.json not in (None, "-"):
+            self.files.append(Path(arguments.json))
+            _require_writable(self.files[1], "--json")
         self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
         self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)
-        self.out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
-        self.out.mkdir(parents=True, exist_ok=True)
         self.granted = {} if arguments.fast else request_realtime(settings.realtime)
-        self.console = Console()
+        self.console = _screen(arguments)
 
     def drive(self) -> int:
         """From start to goal in every world."""
@@ -332,8 +349,33 @@ class Episodes:
         return Episode(layout.seed, result, collisions, distance)
 
     def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
-        for observer in filter(None, (self.recorder, self.page)):
-            observer.close()
+        """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""
+        code = OK
+        if any(episode.result.refused for episode in episodes):
+            code = BAD_GOAL
+        if any(episode.result.fault for episode in episodes):
+            code = FAULT
+        interrupted: list[bool] = []
+        with noting_signals(lambda: interrupted.append(True)):  # pictures can be spared, the account cannot
+            for observer in filter(None, (self.recorder, self.page)):
+                observer.close()
+            summary = self._summary(episodes, drives)
+            print_summary(summary, self.console)
+            if self.recorder is not None:
+                self.console.print(f"recording: {self.recorder}", highlight=False)
+            self.console.print(f"run folder: {self.out}", highlight=False)
+            if self.arguments.json == "-":
+                print(json.dumps(summary, indent=2), flush=True)
+            for file in self.files:
+                _save(file, summary)
+        try:
+            if not (self.arguments.no_pictures or interrupted):
+                self._draw(episodes, drives)
+        except KeyboardInterrupt:
+            print("run_loop: interrupted, pictures are missing", file=sys.stderr)
+        return code
+
+    def _summary(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> dict[str, Any]:
         summary = summarise(episodes, self.driver.timer, self.driver.loop, self.granted)
         summary["recording"] = None if self.recorder is None else self.recorder.summary()
         summary["startup_seconds"] = drives[0].armed_age
@@ -341,20 +383,57 @@ class Episodes:
             summary["adapter"] = {"watchdog_trips": self.remote.watchdog_trips, "realtime": dict(self.remote.realtime)}
         if self.link is not None:
             summary["planner"] = {"restarts": self.link.restart_count(), "seconds": self.link.plan_time.summary()}
-        for file in filter(None, (self.out / "summary.json", self.arguments.json)):
-            file.write_text(json.dumps(summary, indent=2) + "\n")
-        if not self.arguments.no_pictures:
-            for layout, drive, episode in zip(self.layouts, drives, episodes, strict=False):
-                if drive.path:
-                    title = f"{layout.spec}, seed {layout.seed}: {episode.result.reason}"
-                    drive.draw(layout, self.out / f"drive-{layout.seed}.png", title)
-        print_summary(summary, self.console)
-        if self.recorder is not None:
-            self.console.print(f"recording: {self.recorder}", highlight=False)
-        self.console.print(f"run folder: {self.out}", highlight=False)
-        if any(episode.result.fault for episode in episodes):
-            return FAULT
-        return BAD_GOAL if any(episode.result.refused for episode in episodes) else OK
+        return summary
+
+    def _draw(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> None:
+        for layout, drive, episode in zip(self.layouts, drives, episodes, strict=False):
+            if drive.path:
+                title = f"{layout.spec}, seed {layout.seed}: {episode.result.reason}"
+                file = self.out / f"drive-{layout.seed}.png"
+                partial = file.with_name(file.name + ".part")
+                try:
+                    drive.draw(layout, partial, title)
+                    partial.replace(file)
+                except OSError as error:
+                    _warn(file, error)
+                finally:
+                    with suppress(OSError):
+                        partial.unlink()
+
+
+def _screen(arguments: argparse.Namespace) -> Console:
+    """Where people read; the standard output is for JSON alone where --json - asks for it."""
+    return Console(stderr=arguments.json == "-")
+
+
+def _require_writable(file: Path, option: str) -> None:
+    """Make the folder of a file that is to be written later, and see that it can be written to.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    try:
+        if file.is_dir():
+            raise IsADirectoryError(f"{file} is a folder")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=file.parent):
+            pass
+    except OSError as error:
+        raise ValueError(f"{option}: {file} cannot be written: {error.strerror or error}") from None
+
+
+def _save(file: Path, values: Any) -> None:
+    """Write JSON so that nobody ever sees half of it; where that fails, say so and go on."""
+    from hiernav.run import write_atomically  # not needed before, and the robot need not wait for it
+
+    try:
+        write_atomically(file, json.dumps(values, indent=2).encode() + b"\n")
+    except OSError as error:
+        _warn(file, error)
+
+
+def _warn(file: Path, error: OSError) -> None:
+    print(f"run_loop: {file} is not written: {error.strerror or error}", file=sys.stderr)
 
 
 def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
@@ -394,7 +473,7 @@ def _open_page(arguments: argparse.Namespace, driver: Driver, rehearsal: FaultyR
     faults = {} if arguments.adapter else {name: partial(rehearsal.inject, name) for name in FAULTS}
     title = f"hiernav: {spec.name} in {arguments.world}"
     page = ViewerLink(driver, driver.config.robot_radius, driver.config.goal_radius, title, arguments.view, faults)
-    print(f"live page: {page.url}", flush=True)
+    print(f"live page: {page.url}", file=sys.stderr if arguments.json == "-" else sys.stdout, flush=True)
     return page
 
 
