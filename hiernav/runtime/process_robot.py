@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import socket
+import subprocess
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -44,8 +47,8 @@ class ProcessRobot:
             patience: time the robot may take to start, to show its first frame, and to answer a `call` [s].
             environment: variables of that process besides those of this one.
 
-        Raises:
-            RuntimeError: the adapter did not start.
+        What is wrong with the adapter shows where its first answer is waited for: by `control_period`, `action_dim`,
+        `realtime`, `read` and `call`, as a `RobotGone` that says what in one line.
         """
         size = STATUS + 2 * Mailbox.size(CAPACITY)
         self._descriptor = shared_memory(size)
@@ -54,7 +57,6 @@ class ProcessRobot:
         self._commands = Mailbox(memory, STATUS, CAPACITY)
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._calls, theirs = socket.socketpair()
-        self._calls.settimeout(patience)
         self._patience = patience
         settings = json.dumps({"robot": robot, "arguments": dict(arguments or {})})
         with theirs:
@@ -156,7 +158,10 @@ class ProcessRobot:
 
     def _wait_for_start(self) -> dict[str, Any]:
         if self._facts is None:
-            self._facts = self._receive()
+            answer = self._receive()
+            if "error" in answer:
+                raise RobotGone(answer["error"])
+            self._facts = answer
         return self._facts
 
     def _wait_for_frame(self) -> bytes:
@@ -174,14 +179,22 @@ class ProcessRobot:
             raise RobotGone(f"the robot's adapter ended with status {self.child.ended}")
 
     def _receive(self) -> dict[str, Any]:
-        line = b""
+        line, end = b"", time.monotonic() + self._patience
         while not line.endswith(b"\n"):
-            try:
+            ended = self.child.ended is not None  # asked first: what it said at last is still to be read
+            if not select.select([self._calls], [], [], 0.05)[0]:
+                if ended:  # a process that it left behind may hold its end of the socket
+                    self._require_adapter()
+                if time.monotonic() > end:
+                    raise RuntimeError(f"the robot's adapter does not answer for {self._patience:g} s")
+                continue
+            part = b""
+            with suppress(ConnectionError):
                 part = self._calls.recv(65536)
-            except TimeoutError:
-                raise RuntimeError(f"the robot's adapter does not answer for {self._calls.gettimeout()} s") from None
             if not part:
-                self.child.process.wait(5.0)
+                with suppress(subprocess.TimeoutExpired):
+                    self.child.process.wait(5.0)
                 self._require_adapter()
+                raise RobotGone("the robot's adapter does not answer any more")
             line += part
         return json.loads(line)

@@ -2,7 +2,8 @@
 
 Run as `python -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to the
 control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot. Where the robot's own
-code fails, this process brakes the robot before it ends.
+code fails, this process brakes the robot before it ends. A robot that cannot be made or read at all is told to the
+control process in one line.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ END = b"e"
 """News that this process is not needed any more."""
 STATUS = 64
 """Bytes at the front of the memory: what the watchdog has done."""
+PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
+"""What a robot has to have."""
 LAST_BRAKES = 1.0
 """Time for which a robot is braked whose control process is gone, or which has failed, before it is released [s]."""
 
@@ -42,24 +45,36 @@ def main() -> None:
     news, calls, descriptor = map(int, sys.argv[1:4])
     leave_signals_to_parent()
     settings = json.loads(sys.argv[4])
-    robot = make_robot(settings["robot"], settings["arguments"])
-    leave_signals_to_parent()  # once more: the robot's driver may have seen to them
-    sys.exit(Adapter(robot, news, calls, descriptor).run())
+    try:
+        robot = make_robot(settings["robot"], settings["arguments"])
+        leave_signals_to_parent()  # once more: the robot's driver may have seen to them
+        adapter = Adapter(robot, news, calls, descriptor)
+    except BaseException as error:
+        if _frames(error):
+            _tell([error])
+        os.write(calls, _refusal(f"adapter {settings['robot']!r}: {_one_line(error)}"))
+        sys.exit(1)
+    sys.exit(adapter.run())
+
+
+class AdapterError(ValueError):
+    """A name of an adapter that leads to no robot."""
 
 
 def make_robot(name: str, arguments: dict[str, Any]) -> Robot:
     """Call what `name` says, "package.module:function" or "path/to/file.py:function", with `arguments`.
 
     Raises:
-        ValueError: there is no such function.
+        AdapterError: there is no such function, or what it makes is no robot.
+        Exception: whatever that function, or the import of its file or module, raises.
     """
     place, _, function = name.partition(":")
     if not function:
-        raise ValueError(f"robot {name!r}: expected module:function or file.py:function")
+        raise AdapterError("expected file.py:function or package.module:function")
     if place.endswith(".py"):
         spec = importlib.util.spec_from_file_location(Path(place).stem, place)
         if spec is None or spec.loader is None or not Path(place).is_file():
-            raise ValueError(f"robot {name!r}: there is no such file")
+            raise AdapterError("there is no such file")
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
@@ -67,8 +82,12 @@ def make_robot(name: str, arguments: dict[str, Any]) -> Robot:
         module = importlib.import_module(place)
     make: Callable[..., Robot] | None = getattr(module, function, None)
     if make is None:
-        raise ValueError(f"robot {name!r}: {place} has no {function!r}")
-    return make(**arguments)
+        raise AdapterError(f"{place} has no {function!r}")
+    robot = make(**arguments)
+    missing = [part for part in PARTS if not hasattr(robot, part)]
+    if missing:
+        raise AdapterError(f"{function} makes {type(robot).__name__}, which has no {', '.join(missing)}")
+    return robot
 
 
 class Adapter:
@@ -87,6 +106,7 @@ class Adapter:
         self._shown: object = None
         self._fix: tuple[np.ndarray, float] | None = None
         self._braked = 0.0
+        self._introduced = False
 
     def run(self) -> int:
         """Follow the control process until it says so, is gone, or something fails; then brake and release the robot.
@@ -101,6 +121,9 @@ class Adapter:
                 last_brakes = 0.0
         except BaseException as error:
             failures.append(error)
+            if not self._introduced:  # the control process still waits for that
+                with suppress(OSError):
+                    os.write(self._calls, _refusal(f"the robot's adapter cannot start: {_one_line(error)}"))
         failures += self._brake_for(last_brakes)
         _tell(failures)  # not before: there may be nobody who reads it
         try:
@@ -114,9 +137,11 @@ class Adapter:
         """Hand commands over and frames back. True once this process is not needed any more, False if it is alone."""
         robot, idle = self.robot, 0.25 * self._period
         granted = request_realtime()
-        facts = {"control_period": robot.control_period, "action_dim": robot.action_dim, "realtime": granted}
+        period, action_dim = float(robot.control_period), int(robot.action_dim)
+        facts = {"control_period": period, "action_dim": action_dim, "realtime": granted}
         self._publish()
         self._answer(facts)
+        self._introduced = True
         while True:
             ready = select.select([self._news, self._calls], [], [], idle)[0]
             if self._calls in ready and not self._take_call():
@@ -199,6 +224,27 @@ class Adapter:
 
     def _answer(self, answer: dict[str, Any]) -> None:
         os.write(self._calls, json.dumps(answer).encode() + b"\n")
+
+
+def _refusal(why: str) -> bytes:
+    return json.dumps({"error": why}).encode() + b"\n"
+
+
+def _one_line(error: BaseException) -> str:
+    """What is wrong, and the file and line that raised it where that is the robot's own code."""
+    text = " ".join(str(error).split())
+    if isinstance(error, AdapterError):
+        return text
+    frames = _frames(error)
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text}{where}"
+
+
+def _frames(error: BaseException) -> list[traceback.FrameSummary]:
+    """The way to the error through the robot's own code and what that calls; empty where it lies in neither."""
+    ours = (__file__, importlib.__file__)
+    frames = traceback.extract_tb(error.__traceback__)
+    return [each for each in frames if each.filename not in ours and not each.filename.startswith("<frozen importlib")]
 
 
 def _tell(failures: Sequence[BaseException]) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import select
 import socket
 import sys
+import threading
 from functools import partial
+from typing import NoReturn
 
 import msgspec
 import websockets.asyncio.server
@@ -26,7 +29,13 @@ def main(descriptor: int) -> None:
     with socket.socket(fileno=descriptor) as link:
         settings = msgspec.json.decode(link.recv(MAX_BYTES), type=Settings)
         ask = Asker(link)
-        page = Page(settings, ask)
+        # viser serves in a thread of its own, and waits for ever for one that has failed
+        threading.excepthook = lambda failed: _fail(ask, failed.exc_value)
+        try:
+            page = Page(settings, ask)
+        except Exception as error:
+            _fail(ask, error)
+        threading.excepthook = threading.__excepthook__
         ask(Command("ready", text=page.url))
         decoder = messages.TickDecoder()
         while select.select([link], [], [])[0]:
@@ -48,6 +57,12 @@ def main(descriptor: int) -> None:
                     page.tell(item)
             if newest is not None:
                 page.show(newest)
+
+
+def _fail(ask: Asker, error: BaseException | None) -> NoReturn:
+    """Tell the loop in one line why there is no page, and end, whatever threads there are."""
+    ask(Command("failed", text=f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]))
+    os._exit(1)
 
 
 def _refuse_other_sites() -> None:

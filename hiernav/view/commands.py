@@ -33,12 +33,12 @@ class Settings(msgspec.Struct, frozen=True):
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What somebody did on the page."""
 
-    kind: Literal["ready", "goal", "cancel", "pause", "resume", "estop", "acknowledge", "fault"]
+    kind: Literal["ready", "failed", "goal", "cancel", "pause", "resume", "estop", "acknowledge", "fault"]
     x: float = 0.0
     """Of the goal, world frame [m]."""
     y: float = 0.0
     text: Annotated[str, msgspec.Meta(max_length=200)] = ""
-    """Address of the page, or name of the fault."""
+    """Address of the page, why it does not come up, or name of the fault."""
 
 
 class Asker:

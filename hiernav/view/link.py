@@ -144,10 +144,14 @@ class ViewerLink(Observer):
         try:
             self._socket.send(msgspec.json.encode(settings))
             self._socket.settimeout(START_SECONDS)
-            answer = msgspec.json.decode(self._socket.recv(MAX_BYTES), type=Command)
+            data = self._socket.recv(MAX_BYTES)
+            answer = msgspec.json.decode(data, type=Command) if data else Command("failed", text="its process ended")
         except (OSError, msgspec.DecodeError) as error:
             self.close()
             raise ValueError(f"the live page does not come up: {error}") from None
+        if answer.kind != "ready":
+            self.close()
+            raise ValueError(f"the live page does not come up: {answer.text}")
         self._socket.setblocking(False)
         return answer.text
 

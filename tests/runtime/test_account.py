@@ -86,3 +86,11 @@ def test_a_dash_asks_for_json_alone_on_the_standard_output(run, tmp_path, capsys
     assert found == ({"bundle": {"robot": "point"}} if dry else json.loads((tmp_path / "out/summary.json").read_text()))
     assert dry or "goals reached" in shown.err
     assert not (tmp_path / "-").exists()
+
+
+@pytest.mark.parametrize("port", ["70000", "-1", "page"])
+def test_a_port_that_is_none_is_refused_with_usage(run, capsys, port):
+    with pytest.raises(SystemExit) as left:
+        run(f"--view={port}")
+    assert left.value.code == 2
+    assert f"argument --view: '{port}' is no port, expected 0 to 65535" in capsys.readouterr().err

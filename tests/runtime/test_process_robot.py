@@ -19,7 +19,7 @@ from shipped import ROOT
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.process_robot import ProcessRobot, simulated
-from hiernav.runtime.robot import SensorFrame, Truth
+from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
 from hiernav.runtime.robot_process import STATUS, Adapter, make_robot
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_frame
 
@@ -167,15 +167,64 @@ def test_an_adapter_that_ends_is_an_error_at_the_next_read(tmp_path):
     robot.close()
 
 
-def test_a_robot_that_cannot_be_made_is_refused_at_once(tmp_path):
-    robot = ProcessRobot("nothing.py:make", {})
-    with pytest.raises(RuntimeError, match="adapter ended with status 1"):
+@pytest.mark.parametrize(
+    ("code", "name", "why", "traced"),
+    [
+        (None, "a.py:make", "there is no such file", False),
+        (None, "foo", "expected file.py:function or package.module:function", False),
+        (None, "no_such_module:make", "ModuleNotFoundError: No module named 'no_such_module'", False),
+        ("make = 3 +\n", "a.py:make", "SyntaxError: invalid syntax (a.py, line 1)", False),
+        ("def make(): return 5\n", "a.py:make", "make makes int, which has no control_period, action_dim, read", False),
+        ("x = 1\n", "a.py:make", "a.py has no 'make'", False),
+        ("def make(port): ...\n", "a.py:make", "TypeError: make() missing 1 required positional argument", False),
+        ("def make():\n    return open('/dev/none')\n", "a.py:make", "none' (a.py:2)", True),
+        ("import sys\nsys.exit('no bus')\n", "a.py:make", "SystemExit: no bus (a.py:2)", True),
+    ],
+)  # fmt: skip
+def test_a_robot_that_cannot_be_made_is_refused_at_once_in_one_line(
+    tmp_path, monkeypatch, capfd, code, name, why, traced
+):
+    monkeypatch.chdir(tmp_path)
+    if code is not None:
+        Path("a.py").write_text(code)
+    began = time.monotonic()
+    robot = ProcessRobot(name)
+    with pytest.raises(RobotGone) as refused:
+        robot.control_period  # noqa: B018
+    robot.close()
+    assert time.monotonic() - began < 15.0
+    assert str(refused.value).startswith(f"adapter {name!r}: ") and why in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert ("Traceback" in capfd.readouterr().err) == traced
+
+
+def test_a_robot_that_cannot_be_read_at_first_is_braked_and_refused_with_what_it_said(tmp_path):
+    log = tmp_path / "log"
+    robot = ProcessRobot(SCRIPTED, {"path": str(log), "fails": "read"})
+    with pytest.raises(RobotGone, match=r"cannot start: OSError: read: bus error \(scripted_robot.py:\d+\)"):
         robot.read()
     robot.close()
-    for name, why in (("no_colon", "expected module:function"), (f"{tmp_path}/x.py:make", "no such file"),
-                      ("hiernav.runtime.sim_robot:nothing", "has no 'nothing'")):  # fmt: skip
-        with pytest.raises(ValueError, match=why):
-            make_robot(name, {})
+    assert [line.split()[0] for line in log.read_text().splitlines()][-2:] == ["brake", "close"]
+
+
+def test_an_adapter_that_has_ended_is_noticed_although_what_it_started_lives(tmp_path):
+    adapter = tmp_path / "forks.py"
+    adapter.write_text("import os, time\ndef make():\n    if os.fork() == 0: time.sleep(8.0)\n    os._exit(7)\n")
+    began = time.monotonic()
+    robot = ProcessRobot(f"{adapter}:make")
+    with pytest.raises(RobotGone, match="adapter ended with status 7"):
+        robot.read()
+    assert time.monotonic() - began < 6.0
+    robot.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("foo", "expected file.py:function"), ("x.py:make", "no such file"), ("json:no", "has no 'no'")],
+)  # fmt: skip
+def test_a_name_that_leads_to_no_robot_is_refused(name, why):
+    with pytest.raises(ValueError, match=why):
+        make_robot(name, {})
 
 
 def test_the_example_robot_drives_where_it_is_told():

@@ -228,6 +228,15 @@ def test_a_page_that_does_not_come_up_is_said_so_before_the_robot_moves(program)
         ViewerLink(Asked(), 0.1, 0.3, program=(sys.executable, "-c", program))
 
 
+def test_why_a_page_does_not_come_up_is_passed_on_at_once():
+    """The port cannot be had: the page's server, which has a thread of its own, fails there."""
+    pytest.importorskip("viser")
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="does not come up: OverflowError: .*0-65535"):
+        ViewerLink(Asked(), 0.1, 0.3, port=70000)
+    assert time.monotonic() - began < 20.0
+
+
 def test_a_large_map_is_made_coarser_and_loses_no_obstacle():
     pixels = np.zeros((3000, 2000), dtype=bool)
     pixels[1234, 777] = pixels[-1, -1] = True
