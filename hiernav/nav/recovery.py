@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.path import distances
+from hiernav.nav.path import distances, polyline
+from hiernav.nav.sweep import sweep
 
 _LEAST_FREE = 2
 """Waypoints of a way out that must be free for it to be tried before those that are blocked at once."""
@@ -28,6 +29,9 @@ class Recovery:
     then shown one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as
     long again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each
     without coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
+
+    Each way leads from where the robot is at its turn. It is swept on the newest map at every step and ends before what
+    it meets; if that is near, the turn is the next free one's. A robot that is free to no side is asked to stay.
 
     Attributes:
         counts: (N,) int, recoveries since the reset.
@@ -61,7 +65,11 @@ class Recovery:
         self._place = np.full((num_rows, 2), np.nan)
         self._began = np.full((num_rows, 2), np.nan)
         self._turned = np.full((num_rows, 2), np.nan)
-        self._out: dict[int, list[np.ndarray]] = {}
+        self._bearings: dict[int, np.ndarray] = {}
+        """World frame [rad], of the ways out in the order of their turns."""
+        self._spacing: dict[int, float] = {}
+        self._way: dict[int, np.ndarray] = {}
+        """The way out that is followed, (K, 2) world frame [m]."""
         self.counts = np.zeros(num_rows, dtype=np.int64)
         self._asked = np.zeros(num_rows, dtype=bool)
         self.active = np.zeros(num_rows, dtype=bool)
@@ -83,7 +91,10 @@ class Recovery:
         self._ways_left[:] = 0
 
     def ask(self, row: int) -> None:
-        """Help a robot at the next call, whether it has stood still or not; within the same limits."""
+        """Help a robot at the next call, if its pose is known then, whether it has stood still or not.
+
+        The same limits hold.
+        """
         self._asked[row], self._quiet = True, False
 
     def __call__(
@@ -111,11 +122,12 @@ class Recovery:
         self._forget(rows, position)
         ahead = distances(plan[:, -1], position)
         idle = self._ways_left[rows] == 0
-        stuck = (still & (ahead > self.least_m) | self._asked[rows]) & idle
+        known = np.isfinite(pose).all(axis=1) & np.isfinite(plan).all(axis=(1, 2))
+        stuck = (still & (ahead > self.least_m) | self._asked[rows]) & idle & known
         self._asked[rows] = False
         self.given_up[rows] = stuck & (self._tries[rows] >= self.limit)
         for k in np.flatnonzero(~idle).tolist():
-            self._go_on(int(rows[k]), position[k])
+            self._go_on(int(rows[k]), position[k], occupancy[k])
         for k in np.flatnonzero(stuck & ~self.given_up[rows]).tolist():
             self._begin(int(rows[k]), pose[k], plan[k], occupancy[k])
         active = self._ways_left[rows] > 0
@@ -126,7 +138,7 @@ class Recovery:
             return plan
         followed = plan.copy()
         for k in np.flatnonzero(active).tolist():
-            followed[k] = self._out[int(rows[k])][0]
+            followed[k] = self._way[int(rows[k])]
         return followed
 
     def dim(self, terms: Mapping[str, np.ndarray], rows: np.ndarray | None = None) -> Mapping[str, np.ndarray]:
@@ -152,25 +164,47 @@ class Recovery:
         self._tries[row] += 1
 
     def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
-        ways = ways_out(pose, plan, occupancy, self.radius)
-        first = int(self._tries[row]) * self.ways % len(ways)  # go on where the last recovery in this place ended
-        self._out[row] = [*ways[first:], *ways[:first]]
-        self._began[row] = self._turned[row] = pose[:2]
-        self._trail[row], self._ways_left[row], self._on_way[row] = np.nan, self.ways, 0
+        first = int(self._tries[row]) * self.ways  # go on where the last recovery in this place ended
+        self._bearings[row] = np.roll(_ranked_ways(pose, plan, occupancy, self.radius)[0], -first)
+        self._spacing[row], self._ways_left[row] = _spacing(pose, plan), self.ways
+        self._turn(row, pose[:2], len(plan), occupancy)
+        self._began[row], self._trail[row] = pose[:2], np.nan
         self._remember(row, pose[:2])
         self.counts[row] += 1
 
-    def _go_on(self, row: int, position: np.ndarray) -> None:
+    def _go_on(self, row: int, position: np.ndarray, occupancy: OccupancyMap) -> None:
         """One more step of a recovery: the same way, the next one, or the end."""
         self._on_way[row] += 1
         if np.linalg.norm(position - self._began[row]) > self.reach_m or self._on_way[row] >= 2 * self._try:
             self._ways_left[row] = 0
-        elif self._on_way[row] == self._try and np.linalg.norm(position - self._turned[row]) < self.least_m:
-            self._ways_left[row] -= 1
-            self._out[row].append(self._out[row].pop(0))
-            self._turned[row], self._on_way[row] = position, 0
+        else:
+            tried = self._on_way[row] == self._try and np.linalg.norm(position - self._turned[row]) < self.least_m
+            if tried or not self._leads_on(row, position, occupancy):
+                self._bearings[row] = np.roll(self._bearings[row], -1)
+                self._ways_left[row] -= 1
+                self._turn(row, position, len(self._way[row]), occupancy)
         if self._ways_left[row] == 0:
             self._trail[row] = np.nan  # the plan that follows gets its time
+
+    def _turn(self, row: int, position: np.ndarray, count: int, occupancy: OccupancyMap) -> None:
+        """Follow the first way out that is free, from here; those that are passed over come last."""
+        bearings = self._bearings[row]
+        ways, free = _straight_ways(position, bearings, self._spacing[row], count, occupancy, self.radius)
+        best = int(np.minimum(free, _LEAST_FREE).argmax())
+        self._bearings[row], self._way[row] = np.roll(bearings, -best), ways[best]
+        self._turned[row], self._on_way[row] = position, 0
+
+    def _leads_on(self, row: int, position: np.ndarray, occupancy: OccupancyMap) -> bool:
+        """Whether what is left of the way is free, or asks to stay; it is made to end before what it meets."""
+        way = self._way[row]
+        # not so where the position is unknown
+        if not distances(way[-1], position) > self.least_m:
+            return True
+        left = way[int(distances(way, position).argmin()) :]
+        free = int(_free_waypoints(position, left[None], occupancy, self.radius)[0])
+        if free < len(left):
+            left[free:] = left[free - 1] if free else position
+        return free >= min(_LEAST_FREE, len(left))
 
 
 _AHEAD_FIRST = np.pi / 4 * np.array([0, 4, 2, -2, 1, -1, 3, -3])
@@ -178,28 +212,56 @@ _BACK_FIRST = np.pi / 4 * np.array([4, 0, 2, -2, 3, -3, 1, -1])
 
 
 def ways_out(pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius: float) -> list[np.ndarray]:
-    """Straight plans away from a robot, each up to the first waypoint that is not free and padded there.
+    """Straight plans away from a robot, each up to the first waypoint that is not free to come to and padded there.
 
     Args:
         pose: (3,) world frame [m, m, rad].
         plan: (K, 2) to be left, world frame [m]; the ways out have as many waypoints, as far apart.
         occupancy: map as it is now.
-        radius: of the disc that must fit [m].
+        radius: of the disc that is swept along them [m].
 
     Returns:
         Eight ways (K, 2), world frame [m], in the order to try them: ahead or back, whichever is nearer to the plan;
         the opposite; the sides and then the diagonals, the plan's first. Those that are blocked at once come last.
     """
-    spacing = max(float(np.linalg.norm(plan[0] - pose[:2])), float(np.linalg.norm(np.diff(plan, axis=0), axis=1).max()))
+    return list(_ranked_ways(pose, plan, occupancy, radius)[1])
+
+
+def _ranked_ways(
+    pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """`ways_out` as bearings (8,) in the world frame [rad] and ways (8, K, 2) [m]."""
     middle = plan[len(plan) // 2] - pose[:2]
     bearing = np.arctan2(middle[1], middle[0]) - pose[2]
     turns = _BACK_FIRST if np.cos(bearing) < 0.0 else _AHEAD_FIRST
-    angles = pose[2] + (turns if np.sin(bearing) >= 0.0 else -turns)
-    ways: list[np.ndarray] = []
-    blocked: list[np.ndarray] = []
-    for angle in angles.tolist():
-        along = spacing * np.arange(len(plan) + 1)[:, None] * np.array([np.cos(angle), np.sin(angle)])
-        way = pose[:2] + along
-        free = int(np.argmin([*occupancy.is_free(way[1:], radius), False]))
-        (ways if free >= _LEAST_FREE else blocked).append(way[np.minimum(np.arange(1, len(plan) + 1), free)])
-    return ways + blocked
+    bearings = pose[2] + (turns if np.sin(bearing) >= 0.0 else -turns)
+    ways, free = _straight_ways(pose[:2], bearings, _spacing(pose, plan), len(plan), occupancy, radius)
+    order = np.argsort(free < _LEAST_FREE, kind="stable")
+    return bearings[order], ways[order]
+
+
+def _spacing(pose: np.ndarray, plan: np.ndarray) -> float:
+    """Distance between the waypoints of a plan [m], whose last ones may all lie on the goal."""
+    lengths = distances(plan[1:], plan[:-1])
+    apart = lengths[lengths > 1e-3]
+    return float(np.median(apart) if len(apart) else distances(plan[0], pose[:2]) / len(plan))
+
+
+def _straight_ways(
+    position: np.ndarray, bearings: np.ndarray, spacing: float, count: int, occupancy: OccupancyMap, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ways (B, K, 2) [m] from a position (2,) [m], padded after the last of the (B,) waypoints that are free."""
+    headings = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)[:, None]
+    whole = position + spacing * np.arange(1, count + 1)[:, None] * headings
+    free = _free_waypoints(position, whole, occupancy, radius)
+    number = np.minimum(np.arange(1, count + 1), free[:, None])
+    return position + spacing * number[..., None] * headings, free
+
+
+def _free_waypoints(position: np.ndarray, ways: np.ndarray, occupancy: OccupancyMap, radius: float) -> np.ndarray:
+    """(B,) how many waypoints of ways (B, K, 2) [m] a disc that begins at a position (2,) [m] comes to."""
+    lines = polyline(np.broadcast_to(position, (len(ways), 2)), ways)
+    index, clearance, meets = sweep(lines, occupancy, radius)
+    # where the map has an obstacle in the very place, it does not tell which way leads out of it
+    meets |= clearance <= 0.0
+    return np.where(meets.any(axis=1), np.ceil(index[meets.argmax(axis=1)]) - 1, ways.shape[1]).astype(np.intp)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from hiernav.nav.observation import observation_layout
-from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
+from hiernav.nav.occupancy import OccupancyMap, draw_boxes, draw_discs, empty_map
 from hiernav.nav.option import HierarchicalAgent, PlanQuery, WaypointOption
 from hiernav.nav.recovery import Recovery, ways_out
 
@@ -147,6 +147,74 @@ def test_the_end_of_a_recovery_is_told_once_and_asks_for_another_plan() -> None:
     assert asked == [0, WINDOW + DURATION + 1]
 
 
+# a map that changes on the way out
+
+
+def with_box(center: tuple[float, float], half: tuple[float, float]) -> OccupancyMap:
+    """A free map but for an upright box [m]."""
+    walled = empty_map((3.0, 3.0))
+    draw_boxes(walled.occupied, walled.origin, walled.resolution, np.array([center]), np.array([half]))
+    return walled
+
+
+def on_the_way(occupancy: OccupancyMap) -> tuple[Recovery, list[np.ndarray]]:
+    """A recovery that has begun ahead on a free map, and what it says in the next steps on another map."""
+    recovery = Recovery(1, PERIOD)
+    recovery.ask(0)
+    assert bearings([recovery(np.zeros((1, 3)), AHEAD, [FREE])[0]]) == [0]
+    return recovery, [recovery(np.zeros((1, 3)), AHEAD, [occupancy])[0] for _ in range(3)]
+
+
+def test_a_way_that_is_blocked_while_it_is_followed_is_left_for_the_next_free_one() -> None:
+    wall = with_box((0.3, 0.0), (0.05, 3.0))
+    recovery, ways = on_the_way(wall)
+    assert bearings(ways) == [180] * 3
+    assert wall.is_free(np.array(ways), 0.1).all()
+    assert recovery.active.all()
+
+
+def test_a_way_that_is_blocked_farther_off_ends_there() -> None:
+    wall = with_box((0.6, 0.0), (0.05, 3.0))
+    ways = on_the_way(wall)[1]
+    assert bearings(ways) == [0] * 3
+    assert wall.is_free(np.array(ways), 0.1).all() and ways[0][:, 0].max() == pytest.approx(0.4)
+
+
+def test_a_robot_that_is_free_to_no_side_any_more_is_asked_to_stay() -> None:
+    ring = np.pad(np.zeros((4, 4), dtype=bool), 58, constant_values=True)
+    recovery, ways = on_the_way(OccupancyMap(ring, 0.05, FREE.origin))
+    assert_allclose(ways, np.zeros((3, 10, 2)), atol=1e-12)
+    helped = [recovery(np.zeros((1, 3)), AHEAD, [OccupancyMap(ring, 0.05, FREE.origin)]) for _ in range(DURATION)]
+    assert helped[-1] is AHEAD, "for as long as a recovery lasts at most"
+
+
+def test_the_next_way_leads_from_where_the_robot_is_and_over_the_map_as_it_is_then() -> None:
+    recovery = Recovery(1, PERIOD)
+    recovery.ask(0)
+    behind = with_box((-0.4, 0.0), (0.05, 3.0))
+    for t in range(TRY + 1):
+        drifted = np.array([[0.0, 0.008 * t, 0.0]])
+        followed = recovery(drifted, AHEAD, [behind if t > 2 else FREE])[0]
+    assert_allclose(followed[0] - drifted[0, :2], [-0.1, 0.0], atol=1e-12)
+    assert followed[:, 0].min() == pytest.approx(-0.2) and behind.is_free(followed, 0.1).all()
+
+
+def test_a_robot_that_was_pushed_aside_is_not_led_back_through_what_lies_between() -> None:
+    recovery = Recovery(1, PERIOD)
+    recovery.ask(0)
+    recovery(np.zeros((1, 3)), AHEAD, [FREE])
+    wall = with_box((0.0, 0.15), (3.0, 0.025))
+    followed = recovery(np.array([[0.0, 0.35, 0.0]]), AHEAD, [wall])[0]
+    assert followed[:, 1].min() > 0.3
+
+
+def test_no_way_out_is_looked_for_from_an_unknown_pose() -> None:
+    recovery = Recovery(1, PERIOD)
+    recovery.ask(0)
+    assert recovery(np.full((1, 3), np.nan), AHEAD, [FREE]) is AHEAD
+    assert not recovery.active.any()
+
+
 # the ways out
 
 
@@ -200,6 +268,35 @@ def test_ways_that_are_blocked_at_once_come_last() -> None:
     found = ways(AHEAD[0], occupancy=walled)
     assert bearings(found[:1]) == [180]
     assert np.linalg.norm(found[-1][-1]) < 0.2
+
+
+def test_no_way_out_leads_across_a_wall_of_a_robot_that_has_come_along_its_plan() -> None:
+    wall = with_box((0.2, 0.0), (0.05, 3.0))
+    plan = np.column_stack([np.zeros(10), np.linspace(-0.4, 0.5, 10)])
+    found = ways(plan, occupancy=wall)
+    assert max(way[:, 0].max() for way in found) < 0.1
+    assert bearings(found[:1]) == [180]
+    assert_allclose(np.linalg.norm(found[0], axis=1), 0.1 * np.arange(1, 11))
+
+
+def test_ways_out_are_swept_between_their_waypoints() -> None:
+    thin = with_box((0.45, 0.0), (0.025, 3.0))
+    found = ways(3.0 * AHEAD[0], occupancy=thin)
+    assert thin.is_free([[0.3, 0.0], [0.6, 0.0]], 0.1).all()
+    assert max(way[:, 0].max() for way in found) == pytest.approx(0.3)
+
+
+def test_a_robot_that_touches_an_obstacle_is_free_to_leave_it() -> None:
+    walled = with_box((0.1, 0.0), (0.05, 3.0))
+    assert not walled.is_free(np.zeros(2), 0.1)
+    found = ways(AHEAD[0], occupancy=walled)
+    assert bearings(found[:1]) == [180] and np.linalg.norm(found[0][-1]) == pytest.approx(1.0)
+    assert max(way[:, 0].max() for way in found) < 0.01
+
+
+def test_a_plan_that_ends_at_the_goal_still_tells_how_far_apart_its_waypoints_are() -> None:
+    short = AHEAD[0, np.minimum(np.arange(10), 2)]
+    assert_allclose(np.linalg.norm(ways(short)[0], axis=1), 0.1 * np.arange(1, 11))
 
 
 def test_a_robot_that_is_walled_in_stays() -> None:
