@@ -577,7 +577,7 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
             f"{row['steps_mean']:.1f}",
             f"{row['collisions_mean']:.2f}",
             f"{row['collision_free_rate']:.3f}",
-            f"{row['spl_mean']:.3f}",
+            "-" if row["spl_mean"] is None else f"{row['spl_mean']:.3f}",
         )
     console = _console()
     console.print(table)

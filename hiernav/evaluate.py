@@ -44,6 +44,8 @@ class Policies:
     skill: Skill
     network: Network | None
     channels: tuple[str, ...] = ()
+    knows_reward: bool = True
+    """Whether the configuration's reward is the one the skill was trained with: a bundle does not tell it."""
 
     @property
     def is_baseline(self) -> bool:
@@ -101,6 +103,10 @@ def evaluate(
 ) -> dict[str, dict[str, Any]]:
     """Metrics of every world, by its name; the same for the same seed, whatever `rows` is.
 
+    Beside `summarize`, a row says what helped: `repair` (plans of the network were verified), `recover` (a robot that
+    stands still got a way out; never one whose skill follows no waypoints), and the rule of replanning (`period`,
+    `invalid`). `return_mean` is null where the reward is not known, as that of a bundle.
+
     Args:
         protocol: "paper" or "strict".
         planner: "cnn" or "astar".
@@ -129,9 +135,12 @@ def evaluate(
             "world": name,
             "robot": policies.config.robot,
             "protocol": protocol,
-            "planner": "none" if policies.is_baseline else planner,
+            **_planned_by(policies, planner, plan),
+            "recover": task.recovery is not None,
+            "period": policies.config.option.period,
+            "invalid": policies.config.option.invalid,
             "seed": seed,
-            **summarize(done),
+            **summarize(done, policies.knows_reward),
             **_plan_counts(plan),
             "redraws": sum(layout.redraws for layout in layouts),
             "seconds": round(time.perf_counter() - began, 2),
@@ -150,6 +159,8 @@ def evaluate_plans(
 ) -> dict[str, Any]:
     """Metrics of a disc of planning radius that walks along plans (`walk`), moving obstacles at rest.
 
+    `planner` and `repair` are told as by `evaluate`; there is neither recovery nor a rule of replanning.
+
     Args:
         planner: "cnn" or "astar".
         repair: see `make_planner`.
@@ -166,8 +177,7 @@ def evaluate_plans(
     walks = WalkResult(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(WalkResult)))
     return {
         "world": str(world),
-        "planner": planner,
-        "repair": repair,
+        **_planned_by(policies, planner, plan),
         "episodes": episodes,
         "seed": seed,
         "radius_m": radius,
@@ -189,8 +199,17 @@ def episode_seeds(seed: int, count: int) -> np.ndarray:
     return np.random.SeedSequence((seed, 0xE9A1)).generate_state(count)
 
 
-def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Metrics of finished episodes."""
+def summarize(episodes: Sequence[Episode], knows_reward: bool = True) -> dict[str, Any]:
+    """Metrics of finished episodes.
+
+    `spl_mean` is over the episodes that have one, null if none does; `spl_unknown` counts the others: reached, though
+    no shortest path was found.
+
+    Args:
+        knows_reward: whether returns are by the reward that is meant; else `return_mean` is null.
+    """
+    spl = np.array([e.spl for e in episodes])
+    known = np.isfinite(spl)
     reached = np.array([e.reached for e in episodes])
     collisions = np.array([e.collisions for e in episodes])
     reasons = [r.name.lower() for r in TerminationReason if r != TerminationReason.NONE]
@@ -201,8 +220,9 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, Any]:
         "steps_mean": float(np.mean([e.steps_counted for e in episodes])),
         "collisions_mean": float(collisions.mean()),
         "collision_free_rate": float((reached & (collisions == 0)).mean()),
-        "spl_mean": float(np.nanmean([e.spl for e in episodes])),
-        "return_mean": float(np.mean([e.return_ for e in episodes])),
+        "spl_mean": float(spl[known].mean()) if known.any() else None,
+        "spl_unknown": int((~known).sum()),
+        "return_mean": float(np.mean([e.return_ for e in episodes])) if knows_reward else None,
         "replans": {reason: sum(e.replans[reason] for e in episodes) for reason in reasons},
         "endings": {kind: sum(e.reason == kind for e in episodes) for kind in sorted({e.reason for e in episodes})},
         "refused": sum(e.refused for e in episodes),
@@ -218,6 +238,11 @@ def wilson_interval(successes: int, trials: int, z: float = _Z95) -> tuple[float
     middle = (rate + z2 / 2) / (1 + z2)
     half = z * np.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials)) / (1 + z2)
     return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+
+
+def _planned_by(policies: Policies, kind: str, planner: Planner) -> dict[str, Any]:
+    """What a row says of who planned, and whether plans were verified."""
+    return {"planner": "none" if policies.is_baseline else kind, "repair": isinstance(planner, VerifiedPlanner)}
 
 
 def _plan_counts(planner: Planner) -> dict[str, int]:
@@ -253,7 +278,7 @@ def _from_bundle(path: Path) -> Policies:
     )
     bundle.require_layout(skill_layout(config))
     loaded = load_policies(bundle)
-    return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels)
+    return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels, knows_reward=False)
 
 
 def _from_run(path: Path) -> Policies:
@@ -275,4 +300,5 @@ def _from_run(path: Path) -> Policies:
         TorchSkill(load_actor(run.config, skill)),
         None if network is None else TorchNetwork(network),
         () if network is None else tuple(network.channels),
+        knows_reward="replay" in skill,  # a skill that was taken over from a bundle has none, and no reward either
     )

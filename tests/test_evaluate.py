@@ -94,10 +94,52 @@ def test_a_summary_counts_every_episode_once():
     assert summary["collisions_mean"] == 1.0
     assert summary["collision_free_rate"] == 0.25  # reached AND untouched: the timeout without contact is none
     assert summary["spl_mean"] == pytest.approx((0.5 + 1.0 + 0.0 + 0.0) / 4)
+    assert summary["spl_unknown"] == 0
     assert summary["return_mean"] == 0.5
     assert summary["endings"] == {"goal": 2, "left_field": 1, "timeout": 1}
     assert summary["replans"] == dict.fromkeys(REASONS, 3) | {"half_index": 10}
     assert (summary["refused"], summary["recoveries"]) == (2, 4)
+
+
+def test_episodes_without_a_shortest_path_are_counted_and_left_out_of_spl():
+    unknown, half = episode(shortest_length=float("nan")), episode(path_length=2.0, shortest_length=1.0)
+    failed = episode(reached=False, reason="timeout", shortest_length=float("nan"))
+    some, none = summarize([unknown, half, failed, unknown]), summarize([unknown])
+    assert (some["spl_mean"], some["spl_unknown"]) == (pytest.approx((0.5 + 0.0) / 2), 2)
+    assert (none["spl_mean"], none["spl_unknown"]) == (None, 1)
+
+
+def test_a_return_by_a_reward_that_is_not_known_is_none():
+    assert summarize([episode()], knows_reward=False) == summarize([episode()]) | {"return_mean": None}
+    for known in (True, False):
+        row = evaluate(policies_of(knows_reward=known), [WORLD], planner="astar", episodes=2)[tiny_run.WORLD]
+        assert (row["return_mean"] is not None) == known
+
+
+@pytest.mark.parametrize("recover", [True, False])
+@pytest.mark.parametrize(("guidance", "planner"), [("default", "astar"), ("baseline", "none")])
+def test_a_row_says_what_helped(guidance: str, planner: str, recover: bool):
+    settings = ["robot=point", f"skill.preset={guidance}", "option.period=9", "option.invalid=false"]
+    policies = policies_of(
+        config=load_config(None, settings), skill=lambda observation: np.zeros((len(observation), 2))
+    )
+    row = evaluate(policies, [WORLD], planner="astar", episodes=1, recover=recover)[tiny_run.WORLD]
+    assert (row["planner"], row["repair"], row["period"], row["invalid"]) == (planner, False, 9, False)
+    assert row["recover"] is (recover and guidance == "default")
+    for repair in (True, False):
+        walked = evaluate_plans(policies, WORLD, "astar", repair, episodes=2)
+        assert (walked["planner"], walked["repair"]) == (planner, False)
+
+
+@pytest.mark.train
+def test_a_fine_tuning_of_a_bundle_does_not_know_its_reward_either(able_run: Path, able_bundle: Path, tmp_path: Path):
+    from hiernav.finetune import begin_fine_tuning, fine_tuning_config
+
+    for source, known in ((able_run, True), (able_bundle, False)):
+        for folder in (tmp_path / f"{known}", tmp_path / f"{known}-again"):
+            begin_fine_tuning(fine_tuning_config(source, [f"run_dir={folder}"]), source).close()
+            assert open_policies(folder).knows_reward == known
+            source = folder
 
 
 def test_the_seeds_of_a_short_evaluation_are_the_first_of_a_long_one():
@@ -223,6 +265,8 @@ def test_the_network_plans_verified_or_alone(able_run: Path):
     assert checked["proposals"] >= checked["repairs"] > 0
     assert checked["proposals"] >= sum(checked["replans"].values()) - checked["replans"]["goal"]
     assert "proposals" not in alone
+    assert (checked["planner"], checked["repair"], checked["recover"]) == ("cnn", True, True)
+    assert (alone["planner"], alone["repair"]) == ("cnn", False)
 
 
 @pytest.mark.train
@@ -233,6 +277,7 @@ def test_plans_are_walked_along_verified_or_alone(able_run: Path):
     assert told == [100, 120]
     assert checked["collisions_total"] == expert["collisions_total"] == 0 < alone["collisions_total"]
     assert checked["repairs"] > 0 and "repairs" not in alone
+    assert [row["repair"] for row in (checked, alone, expert)] == [True, False, False]
     assert checked["reach_rate"] == expert["reach_rate"] == 1.0
     assert alone["collisions_mean"] == alone["collisions_total"] / 120
 
@@ -255,6 +300,7 @@ def test_a_run_and_its_bundle_drive_the_same_episodes(able_run: Path, able_bundl
             np.array([episodes[k].steps for k in range(12)]),
         )
         assert row["replans"]["start"] == 12
+        assert (row["return_mean"] is None) == (source is able_bundle)
     *ours, steps = driven[able_run]
     *theirs, other_steps = driven[able_bundle]
     assert ours == theirs

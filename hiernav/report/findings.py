@@ -139,6 +139,7 @@ def _above_baseline(book: Book, robot: str) -> Finding:
     for seed in sorted(ours.keys() & theirs.keys()):
         a, b = drive_of(ours[seed]), drive_of(theirs[seed])
         assert a is not None and b is not None, "a training ends with a drive"
+        assert a.return_mean is not None and b.return_mean is not None, "the reward of a training is known"
         if (a.reach_rate, a.return_mean) > (b.reach_rate, b.return_mean):
             met += 1
         else:

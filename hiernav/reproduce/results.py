@@ -81,7 +81,8 @@ class Drive(msgspec.Struct, frozen=True, kw_only=True):
     collision_free_rate: float
     spl_mean: float | None
     spl_half95: float | None
-    return_mean: float
+    return_mean: float | None
+    """None where the reward is not known; in results of older versions by the default one then, from a bundle."""
     steps_between_plans: float | None
     endings: dict[str, int]
     """How often episodes ended by each of "goal", "left_field", "timeout", "fallen", "physics" (`Episode.reason`)."""

@@ -7,7 +7,7 @@ import math
 import shutil
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,8 @@ def driven(
 
     Args:
         settings: `episodes`, and what differs: `paper_episodes`, `planner`, `repair`, `recover`, `period`, `invalid`.
-        reward: to measure returns by, instead of the one the policies were trained with.
+        reward: to measure returns by, instead of the one the policies were trained with. Without it, returns of a
+            bundle, which does not tell its reward, are null.
     """
     config = policies.config
     names = {field.name for field in msgspec.structs.fields(OptionConfig)}
@@ -115,6 +116,7 @@ def driven(
     config = msgspec.structs.replace(config, option=msgspec.structs.replace(config.option, **option))
     if reward is not None:
         config = msgspec.structs.replace(config, reward=reward)
+    policies = replace(policies, config=config, knows_reward=policies.knows_reward or reward is not None)
     spec, episodes = parse_world(world), dict[int, Episode]()
 
     def keep(_: str, number: int, episode: Episode) -> None:
@@ -122,7 +124,7 @@ def driven(
         report(len(episodes) / settings["episodes"], f"{len(episodes)} of {settings['episodes']} episodes")
 
     found = evaluate(
-        Policies(config, policies.skill, policies.network, policies.channels),
+        policies,
         [spec],
         "strict",
         settings.get("planner", "cnn"),
@@ -137,7 +139,8 @@ def driven(
     metrics = {"strict": {**found, **_more(done)}}
     if count := settings.get("paper_episodes"):
         counted = under_protocol(done[:count], "paper", spec)
-        metrics["paper"] = {**summarize(counted), **_more(counted)}
+        helped = {name: found[name] for name in ("planner", "repair", "recover", "period", "invalid")}
+        metrics["paper"] = {**helped, **summarize(counted, policies.knows_reward), **_more(counted)}
     return metrics
 
 

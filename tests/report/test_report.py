@@ -128,6 +128,24 @@ def test_an_interval_over_seeds_is_students():
     assert of_seeds([]) is None
 
 
+def test_results_with_and_without_a_return_are_read(tmp_path):
+    result = made_up.result_of(made_up.CELLS["table3/car-shipped-gremlin"])
+    for value in (None, -3.0):
+        strict = result.metrics["strict"] | {"return_mean": value}
+        write_result(tmp_path, msgspec.structs.replace(result, metrics={"strict": strict}))
+        book = Book.open(tmp_path)
+        assert book.damaged == []
+        found = book.group("table3", "shipped", "car", "gremlin").estimate("return_mean")
+        assert (found and found.mean) == value
+
+
+def test_beside_the_baseline_the_page_says_that_it_is_never_helped_out(page):
+    for section in ("table3", "efficiency"):
+        text = page.partition(f'<section id="{section}">')[2].partition("</section>")[0]
+        told = " ".join(text_of(text).split())
+        assert "this helps only a skill that follows waypoints, so the baseline never gets it." in told
+
+
 def test_an_interval_over_episodes_is_cut_to_what_is_possible(tmp_path):
     result = made_up.result_of(made_up.CELLS["table3/car-shipped-gremlin"])
     few = {

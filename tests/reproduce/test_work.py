@@ -47,6 +47,16 @@ def test_the_papers_protocol_is_the_first_episodes_of_the_strict_one():
             key: value for key, value in together[protocol].items() if key in alone and key not in ("seconds",)
         }.items()  # fmt: skip
     assert together["paper"]["collisions_mean"] == 0.0
+    for row in together.values():
+        assert (row["planner"], row["repair"], row["recover"], row["period"]) == ("cnn", True, True, None)
+
+
+def test_returns_of_a_bundle_are_told_by_a_reward_that_is_given_alone():
+    policies = open_policies(POINT)
+    settings = {"episodes": 2, "paper_episodes": 1}
+    for reward in (None, policies.config.reward):
+        found = driven(policies, "pillar(1.2,1.2,1)", settings, lambda *_: None, reward)
+        assert {row["return_mean"] is None for row in found.values()} == {reward is None}
 
 
 def test_a_fixed_period_is_what_lies_between_plans():
