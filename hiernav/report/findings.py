@@ -139,8 +139,8 @@ def _above_baseline(book: Book, robot: str) -> Finding:
     for seed in sorted(ours.keys() & theirs.keys()):
         a, b = drive_of(ours[seed]), drive_of(theirs[seed])
         assert a is not None and b is not None, "a training ends with a drive"
-        assert a.return_mean is not None and b.return_mean is not None, "the reward of a training is known"
-        if (a.reach_rate, a.return_mean) > (b.reach_rate, b.return_mean):
+        earned = a.return_mean is not None and b.return_mean is not None and a.return_mean > b.return_mean
+        if a.reach_rate > b.reach_rate or (a.reach_rate == b.reach_rate and earned):
             met += 1
         else:
             missed.append(f"seed {seed} ({a.reach_rate:.3f} against {b.reach_rate:.3f})")

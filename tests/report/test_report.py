@@ -139,6 +139,16 @@ def test_results_with_and_without_a_return_are_read(tmp_path):
         assert (found and found.mean) == value
 
 
+@pytest.mark.parametrize(("returns", "met"), [((2.0, 1.0), True), ((1.0, 2.0), False), ((None, 1.0), False)])
+def test_of_equal_reach_rates_known_returns_decide(returns, met):
+    results = []
+    for variant, value in zip(("ours", "baseline"), returns, strict=True):
+        result = made_up.result_of(made_up.CELLS[f"sample_efficiency/point-{variant}-0"])
+        strict = result.metrics["strict"] | {"reach_rate": 0.9, "return_mean": value}
+        results.append(msgspec.structs.replace(result, metrics={"strict": strict}))
+    assert told._above_baseline(Book(Path(), results, []), "point").met is met
+
+
 def test_beside_the_baseline_the_page_says_that_it_is_never_helped_out(page):
     for section in ("table3", "efficiency"):
         text = page.partition(f'<section id="{section}">')[2].partition("</section>")[0]
