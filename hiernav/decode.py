@@ -1,6 +1,7 @@
 """Strict decoding of settings: YAML text to typed, frozen structs, with errors that say what to change and where.
 
-The YAML read here is the 1.2 core schema: `3e-4` is a number, `on` and `010` are text, and a repeated key is an error.
+The YAML read here is the 1.2 core schema: `3e-4` is a number, `on` and `010` are text, and a repeated key, an
+alias and a tag are errors.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import yaml
 from msgspec import inspect as types
+
+from hiernav.nav.plain_yaml import PlainLoader
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -46,7 +49,7 @@ def parse_yaml(text: str, source: str) -> Any:
         source: name of the file (or other origin) for messages.
 
     Raises:
-        ConfigError: malformed YAML or a repeated key; names source and line.
+        ConfigError: malformed YAML, a repeated key, an alias or a tag; names source and line.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -187,16 +190,8 @@ _CORE_SCHEMA = [
 ]
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(PlainLoader):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        # A few lines of aliases stand for values of any size, which an error message would spell out.
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(
-                problem="aliases are not accepted", problem_mark=self.peek_event().start_mark
-            )
-        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()

@@ -192,7 +192,10 @@ def test_an_unknown_key_is_refused_and_the_nearest_is_named(
         ("seed: 1\nrobot: car\nseed: 2\n", 3, "repeated key 'seed'"),
         ("skill:\n  tau: 0.1\n  tau: 0.1\n", 3, "repeated key 'tau'"),
         ("seed: 1\nrun_dir: \x07\n", 2, "characters"),
-        ("seed: 1\nrobot: !!python/name:os.system\n", 2, "constructor"),
+        ("seed: 1\nrobot: !!python/name:os.system\n", 2, "tags are not accepted: '!!python/name:os.system'"),
+        ('seed: 1\nskill: {num_envs: !!int ""}\n', 2, "tags are not accepted: '!!int'"),
+        ("!!map {seed: 1}\n", 1, "tags are not accepted: '!!map'"),
+        ("!!str seed: 1\n", 1, "tags are not accepted: '!!str'"),
         ("seed: 1\n? [a]\n: 2\n", 2, "unhashable"),
         ("seed: &other 1\nskill: *other\n", 2, "aliases are not accepted"),
         ("seed: 1\n---\nseed: 2\n", 2, "document"),
@@ -230,6 +233,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         ("=3", ["unknown key ''"]),
         ("skill.tau=[", ["skill.tau", "malformed YAML"]),
         ("skill.tau=", ["skill.tau = None", "float"]),
+        ('seed=!!int ""', ["seed:1: malformed YAML: tags are not accepted: '!!int'"]),
+        ("seed=!!bool foo", ["seed:1: malformed YAML: tags are not accepted: '!!bool'"]),
+        ('seed=!!float ""', ["seed:1: malformed YAML: tags are not accepted: '!!float'"]),
+        ("seed=!!timestamp foo", ["seed:1: malformed YAML: tags are not accepted: '!!timestamp'"]),
+        ("seed=! foo", ["seed:1: malformed YAML: tags are not accepted: '!'"]),
     ],
 )
 def test_a_wrong_override_is_refused_and_not_blamed_on_the_file(

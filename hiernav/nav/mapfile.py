@@ -15,6 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from hiernav.nav.occupancy import MAX_SIDE, RESOLUTION, OccupancyMap, check_geometry
+from hiernav.nav.plain_yaml import PlainLoader
 
 MAX_YAML_BYTES = 65536
 MAX_PIXELS = 2**26
@@ -58,7 +59,7 @@ def load_map(path: str | Path) -> OccupancyMap:
             "they must satisfy 0 <= free_thresh <= occupied_thresh <= 1"
         )
     if entries.get("mode", "trinary") != "trinary":
-        raise MapFileError(f"{path}: mode {entries['mode']!r}, only 'trinary' is accepted")
+        raise MapFileError(f"{path}: mode {_shown(entries['mode'])}, only 'trinary' is accepted")
     image_path = _image_path(path, entries)
 
     def check_size(width: int, height: int) -> None:
@@ -82,27 +83,18 @@ def load_map(path: str | Path) -> OccupancyMap:
     return _resampled(~free[::-1], resolution, origin)
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases: a few lines of them stand for values of any size."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(
-                problem="aliases are not accepted", problem_mark=self.peek_event().start_mark
-            )
-        return super().compose_node(parent, index)
-
-
 def _read_entries(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             text = file.read(MAX_YAML_BYTES + 1)
     except OSError as error:
         raise MapFileError(f"{path}: the map file cannot be read ({error.strerror})") from error
+    except ValueError as error:  # a path with a null character
+        raise MapFileError(f"map {str(path)!r} cannot be read ({error})") from error
     if len(text) > MAX_YAML_BYTES:
         raise MapFileError(f"{path}: longer than {MAX_YAML_BYTES} bytes, this is no map_server YAML file")
     try:
-        entries = yaml.load(text, Loader=_PlainLoader)
+        entries = yaml.load(text, Loader=PlainLoader)
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
         # PyYAML lets through what the constructors of dates and numbers raise
         raise MapFileError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
@@ -119,7 +111,16 @@ def _number(path: Path, entries: dict[str, Any], key: str) -> float:
         # YAML 1.1 reads 5e-2 as text, which float() understands
         return float(entries[key])
     except (TypeError, ValueError, OverflowError) as error:
-        raise MapFileError(f"{path}: {key} {entries[key]!r}, it must be a number") from error
+        raise MapFileError(f"{path}: {key} {_shown(entries[key])}, it must be a number") from error
+
+
+def _shown(value: Any) -> str:
+    """A value for a message: not all of a long one, and none of a number that Python refuses to write out."""
+    try:
+        text = repr(value)
+    except ValueError:
+        return f"{type(value).__name__} of too many digits"
+    return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def _origin(path: Path, entries: dict[str, Any]) -> tuple[float, float]:
@@ -127,9 +128,9 @@ def _origin(path: Path, entries: dict[str, Any]) -> tuple[float, float]:
     try:
         x, y, yaw = (float(v) for v in value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise MapFileError(f"{path}: origin {value!r}, it must be three numbers [x, y, yaw]") from error
+        raise MapFileError(f"{path}: origin {_shown(value)}, it must be three numbers [x, y, yaw]") from error
     if not all(map(math.isfinite, (x, y, yaw))):
-        raise MapFileError(f"{path}: origin {value!r}, its numbers must be finite")
+        raise MapFileError(f"{path}: origin {_shown(value)}, its numbers must be finite")
     if yaw != 0.0:
         raise MapFileError(f"{path}: origin yaw {yaw} rad, rotated maps are not accepted: rotate the picture instead")
     return x, y
@@ -138,7 +139,7 @@ def _origin(path: Path, entries: dict[str, Any]) -> tuple[float, float]:
 def _image_path(path: Path, entries: dict[str, Any]) -> Path:
     name = entries["image"]
     if not isinstance(name, str) or not name or "\0" in name:
-        raise MapFileError(f"{path}: image {name!r}, it must be the name of a PGM or PNG file")
+        raise MapFileError(f"{path}: image {_shown(name)}, it must be the name of a PGM or PNG file")
     folder = path.resolve().parent
     image_path = (folder / name).resolve()
     if not image_path.is_relative_to(folder):

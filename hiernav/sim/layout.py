@@ -225,6 +225,8 @@ def cached_map(path: str) -> OccupancyMap:
         status = Path(path).stat()
     except OSError as error:
         raise ValueError(f"world map({path}): the map file cannot be read ({error.strerror})") from error
+    except ValueError as error:  # a path with a null character
+        raise ValueError(f"world map({path!r}): the map file cannot be read ({error})") from error
     return _load_version(path, status.st_mtime_ns, status.st_size)
 
 

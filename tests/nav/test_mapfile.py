@@ -141,6 +141,10 @@ def test_the_area_is_kept_where_pixels_divide_evenly(folder: Path) -> None:
         ({"negate": 2}, "negate 2"),
         ({"free_thresh": 0.7}, "free_thresh 0.7 and occupied_thresh 0.65"),
         ({"occupied_thresh": ".nan"}, "occupied_thresh nan"),
+        ({"resolution": "0x" + "f" * 6000}, "hall.yaml: resolution int of too many digits, it must be a number"),
+        ({"origin": f"[0x{'f' * 6000}, 0, 0]"}, "hall.yaml: origin list of too many digits, it must be three numbers"),
+        ({"image": "0x" + "f" * 6000}, "hall.yaml: image int of too many digits, it must be the name"),
+        ({"mode": "0x" + "f" * 6000}, "hall.yaml: mode int of too many digits, only 'trinary'"),
         ({"mode": "raw"}, "mode 'raw', only 'trinary'"),
     ],
 )
@@ -158,7 +162,13 @@ def test_a_malformed_entry_is_named(folder: Path, changes: dict[str, object], re
         ("#" * 70000, "longer than"),
         ("image: 2001-99-99", "not a YAML file"),
         ("image: " + "1" * 5000, "not a YAML file"),
-        ("image: !!timestamp x", "not a YAML file"),
+        ("image: !!timestamp x", "not a YAML file .tags are not accepted: '!!timestamp'.* line 1, column 8"),
+        ("resolution: !!bool foo", "tags are not accepted: '!!bool'"),
+        ('negate: !!int ""', "tags are not accepted: '!!int'"),
+        ('negate: !!float ""', "tags are not accepted: '!!float'"),
+        ("!!set {a, b}", "tags are not accepted: '!!set'"),
+        ("origin: !!seq [0, 0, 0]", "tags are not accepted: '!!seq'"),
+        ("mode: !local trinary", "tags are not accepted: '!local'"),
         ("[" * 5000, "not a YAML file"),
         ("a: &a [x, x]\nimage: *a", "aliases are not accepted"),
     ],
@@ -168,6 +178,11 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path, text: str, reason:
     path.write_text(text)
     with pytest.raises(MapFileError, match=reason):
         load_map(path)
+
+
+def test_a_map_whose_name_no_file_can_have_is_named() -> None:
+    with pytest.raises(MapFileError, match=r"^map 'ha\\x00ll' cannot be read \(embedded null byte\)$"):
+        load_map("ha\0ll")
 
 
 def test_a_missing_map_file_is_refused(tmp_path: Path) -> None:
