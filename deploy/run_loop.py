@@ -244,7 +244,8 @@ def _run(arguments: argparse.Namespace) -> int:
         layouts = [_layout(world, arguments.seed + k, spec, goal, start_known) for k in range(arguments.episodes)]
         link = None
         if not arguments.fast and arguments.planner != "sync":
-            link = ProcessPlanner(bundle, settings.driver.robot_radius, layouts[0].occupancy(0.0).occupied.size)
+            pixels, driver = layouts[0].occupancy(0.0).occupied.size, settings.driver
+            link = ProcessPlanner(bundle, driver.robot_radius, pixels, goal_radius=driver.goal_radius)
             stack.callback(link.close)
         episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
         return episodes.serve() if arguments.serve or view else episodes.drive()

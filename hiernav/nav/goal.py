@@ -18,14 +18,17 @@ class GoalRefused(ValueError):
         self.code = code
 
 
-def place_goal(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, tolerance: float) -> np.ndarray:
-    """The goal itself, or where it lies in an obstacle the nearest free point.
+def place_goal(
+    occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, tolerance: float, radius: float = 0.0
+) -> np.ndarray:
+    """The goal itself, or where it lies in an obstacle the nearest point with room, or if there is none a free one.
 
     Args:
         occupancy: the map.
         start: (2,) where the robot is, world frame [m].
         goal: (2,) world frame [m].
         tolerance: how far the goal may be moved [m].
+        radius: disc of the robot, for which there should be room [m].
 
     Returns:
         (2,) world frame [m].
@@ -41,7 +44,7 @@ def place_goal(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, tol
         raise GoalRefused("goal_outside", f"goal {_text(goal)} lies outside the map ({_extent(occupancy)})")
     if not occupancy.occupied_at(goal):
         return np.array(goal, dtype=np.float64)
-    free = _nearest_free(occupancy, goal, tolerance)
+    free = _nearest_free(occupancy, goal, tolerance, radius)
     if free is None:
         raise GoalRefused(
             "goal_occupied", f"goal {_text(goal)} lies in an obstacle, and no point within {tolerance:g} m is free"
@@ -49,7 +52,7 @@ def place_goal(occupancy: OccupancyMap, start: np.ndarray, goal: np.ndarray, tol
     return free
 
 
-def _nearest_free(occupancy: OccupancyMap, point: np.ndarray, reach: float) -> np.ndarray | None:
+def _nearest_free(occupancy: OccupancyMap, point: np.ndarray, reach: float, radius: float) -> np.ndarray | None:
     resolution, (x0, y0) = occupancy.resolution, occupancy.origin
     rows, cols = occupancy.occupied.shape
     col0, row0 = (max(math.floor((p - reach - o) / resolution), 0) for p, o in zip(point, (x0, y0), strict=True))
@@ -58,9 +61,11 @@ def _nearest_free(occupancy: OccupancyMap, point: np.ndarray, reach: float) -> n
     row, col = np.nonzero(~occupancy.occupied[row0:row1, col0:col1])
     centers = np.stack([x0 + (col + col0 + 0.5) * resolution, y0 + (row + row0 + 0.5) * resolution], axis=-1)
     apart = np.linalg.norm(centers - point, axis=-1)
-    if not len(apart) or apart.min() > reach:
+    centers, apart = centers[apart <= reach], apart[apart <= reach]
+    if not len(apart):
         return None
-    return centers[apart.argmin()]
+    roomy = occupancy.clearance_at(centers) >= radius
+    return centers[np.where(roomy | ~roomy.any(), apart, np.inf).argmin()]
 
 
 def _text(point: np.ndarray) -> str:

@@ -111,6 +111,10 @@ def images(
     return out
 
 
+_LONGEST = 128
+"""Pixels of the longer side of a pyramid's last level, at most."""
+_MOST_SAMPLES = 16
+"""Per pixel of an image and axis; more are called for only where L is many times the size of the map."""
 _SOURCES = ("obstacles", "visits", "clearance")
 _SIDES = {
     "1": lambda length: length + MARGIN,
@@ -139,7 +143,8 @@ def _pyramid(source: str, occupancy: OccupancyMap, visits: VisitMap) -> list[np.
 
 def _halve(level: np.ndarray, outside: int) -> list[np.ndarray]:
     levels = [level]
-    while min(level.shape) >= 16:
+    # a long and narrow map is seen from so far that it needs levels on which its width is a pixel or two
+    while min(level.shape) >= 16 or max(level.shape) >= _LONGEST:
         rows, cols = level.shape
         if rows % 2 or cols % 2:
             level = cv2.copyMakeBorder(level, 0, rows % 2, 0, cols % 2, cv2.BORDER_CONSTANT, value=outside)
@@ -160,7 +165,8 @@ def _crop(
     pixel = side / PIXELS
     depth = min(max(int(math.log2(pixel / occupancy.resolution) + 1e-9), 0), len(levels) - 1)
     step = occupancy.resolution * 2**depth
-    samples = max(1, math.ceil(pixel / step - 1e-6))  # per pixel and axis, so that none of the level is skipped
+    # per pixel and axis, so that none of the level is skipped
+    samples = min(max(1, math.ceil(pixel / step - 1e-6)), _MOST_SAMPLES)
     count, fine = PIXELS * samples, pixel / samples
     (ux, uy), half = up, 0.5 * (side - fine)
     # right is (uy, -ux); the first sample is the upper left one

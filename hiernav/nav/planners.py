@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,7 +13,10 @@ from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import arc_lengths, polyline
-from hiernav.nav.search import CELL, PathField, keeps_room
+from hiernav.nav.search import CELL, GOAL_REACH, PathField, goal_reach_for, keeps_room
+
+CACHED_CELLS = 500_000
+"""Of all shortest-path fields that a planner keeps: about 80 MB, and 64 maps of up to 8.8 x 8.8 m."""
 
 Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Images (M, C, 64, 64) uint8 and distances L (M,) float32 [m] -> waypoints (M, H, K, 2) in the GOSELO frame [m] and
@@ -33,7 +36,8 @@ _TIGHTNESS = 4.0
 class ShortestPathPlanner:
     """The expert: first waypoints of the smoothed shortest path ("astar" on the command line).
 
-    One field per map and goal answers every query on that map, so only the first query of an episode searches.
+    One field per map and goal answers every query on that map, so only the first query of an episode searches. The
+    fields used last are kept, as many as `cache_size` and `cached_cells` allow, but always the newest.
     """
 
     radius: float = 0.1
@@ -43,7 +47,11 @@ class ShortestPathPlanner:
     num_waypoints: int = 10
     spacing: float = 0.1
     """Distance between waypoints along the path [m]."""
+    goal_reach: float = GOAL_REACH
+    """Farthest end of a path from a goal beside which the disc does not fit [m]."""
     cache_size: int = 256
+    cached_cells: int = CACHED_CELLS
+    """Planning cells of all kept fields together."""
     _fields: OrderedDict[tuple[int, float, float], PathField] = field(default_factory=OrderedDict, repr=False)
 
     def plan(self, query: PlanQuery) -> np.ndarray:
@@ -67,9 +75,10 @@ class ShortestPathPlanner:
         # the field holds its map, so the identity cannot be taken over by another one while the entry lives
         key = (id(occupancy), float(goal[0]), float(goal[1]))
         if key not in self._fields:
-            self._fields[key] = PathField(occupancy, goal, self.radius, self.soft_margin)
-            if len(self._fields) > self.cache_size:
-                self._fields.popitem(last=False)
+            self._fields[key] = PathField(occupancy, goal, self.radius, self.soft_margin, goal_reach=self.goal_reach)
+            cells = sum(kept.cells for kept in self._fields.values())
+            while len(self._fields) > 1 and (len(self._fields) > self.cache_size or cells > self.cached_cells):
+                cells -= self._fields.popitem(last=False)[1].cells
         self._fields.move_to_end(key)
         return self._fields[key]
 
@@ -286,7 +295,16 @@ def _sampled(start: np.ndarray, plans: np.ndarray, spacing: float) -> tuple[np.n
 
 
 def verified_planner(
-    network: Network, channels: tuple[str, ...], expert: ShortestPathPlanner, robot_radius: float
+    network: Network,
+    channels: tuple[str, ...],
+    expert: ShortestPathPlanner,
+    robot_radius: float,
+    goal_radius: float = 0.3,
 ) -> VerifiedPlanner:
-    """A network's plans as robots drive them: checked for a disc of `robot_radius` [m], repaired by the expert."""
-    return VerifiedPlanner(GoseloPlanner(network, channels, expert.radius, expert.soft_margin), expert, robot_radius)
+    """A network's plans as robots drive them: checked for a disc of `robot_radius` [m], repaired by the expert.
+
+    Plans of the expert end within `goal_radius` [m] of the goal, with 0.1 m to spare.
+    """
+    expert = replace(expert, goal_reach=goal_reach_for(goal_radius), _fields=OrderedDict())
+    proposer = GoseloPlanner(network, channels, expert.radius, expert.soft_margin)
+    return VerifiedPlanner(proposer, expert, robot_radius, goal_radius=goal_radius)

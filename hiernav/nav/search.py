@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 CELL = 0.1  # [m], planning grid of the paper
 _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
-GOAL_REACH = 0.3  # [m], a goal with no room for the disc within this is blocked
+STANDING = 0.1  # [m], by which a robot may miss the end of its path, strayed or stopped short
+GOAL_REACH = 0.3 - STANDING  # [m], from the goal to the end of a path, where 0.3 m count as reached
 LEAD = 4.0 * CELL  # [m], beyond its radius, as far as a robot is led to where its way begins
 _DIP = 0.005  # [m], fall of the clearance along a lead that is put down to the pixels of the map
 _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line
@@ -29,7 +30,7 @@ _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried
 REFUSALS = {
     "not_finite": "the position or the goal is no number",
     "no_room": "the robot fits nowhere on the map",
-    "goal_blocked": "the robot fits nowhere within 0.3 m of the goal",
+    "goal_blocked": "the robot fits nowhere so near to the goal that it counts as reached",
     "enclosed": "no way leads from the position to the goal",
     "tight": "the robot does not fit along the first waypoints of the way to the goal",
 }
@@ -41,11 +42,12 @@ class PathField:
 
     Args:
         occupancy: the map.
-        goal: (2,) world frame [m]; where the disc does not fit, the nearest cell where it does stands for it, unless
-            that is farther than `GOAL_REACH`.
+        goal: (2,) world frame [m]; where the disc does not fit, paths end where it does, on the way to the goal from
+            the nearest cell in which it fits. If that is farther than `goal_reach` from the goal, there is no path.
         radius: disc that must fit everywhere on a path [m].
         soft_margin: further clearance that is worth a detour [m].
         soft_weight: relative extra cost of a metre at clearance `radius`.
+        goal_reach: farthest end of a path from the goal [m] (`goal_reach_for`).
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class PathField:
         radius: float,
         soft_margin: float = 0.0,
         soft_weight: float = 8.0,
+        goal_reach: float = GOAL_REACH,
     ) -> None:
         self.occupancy, self.radius = occupancy, radius
         self.soft_margin, self.soft_weight = soft_margin, soft_weight
@@ -66,16 +69,21 @@ class PathField:
         self._free = clearance >= radius
         self._cost, self._next = np.full(len(self._free), np.inf), np.full(len(self._free), -1)
         self.goal_cell = _nearest(self._centers, self._free, self.goal)
-        if self.goal_cell is not None and np.linalg.norm(self._centers[self.goal_cell] - self.goal) > GOAL_REACH:
-            self.goal_cell = None
         self._end = self.goal
+        if self.goal_cell is not None:
+            self._end = self._nearest_end(self._centers[self.goal_cell])
+            if not np.linalg.norm(self._end - self.goal) <= goal_reach:
+                self.goal_cell = None
         if self.goal_cell is not None:
             from scipy.sparse.csgraph import dijkstra  # takes longest to import, and a control loop searches nothing
 
-            if not occupancy.clearance_at(self.goal) >= radius:
-                self._end = self._centers[self.goal_cell]
             graph = _grid_graph(self._free.reshape(self._shape), self._factor(clearance).reshape(self._shape))
             self._cost, self._next = dijkstra(graph, indices=self.goal_cell, return_predecessors=True)
+
+    @property
+    def cells(self) -> int:
+        """How many cells the grid has: what the field's memory grows with."""
+        return len(self._cost)
 
     def distance_at(self, points: np.ndarray) -> np.ndarray:
         """Cost to go [m] of the cells that (M, 2) points lie in; inf where no path starts."""
@@ -101,7 +109,9 @@ class PathField:
             cells.append(cell)
         vertices = self._centers[cells]
         if cell == self.goal_cell:
-            vertices = np.concatenate([vertices[:-1], self._end[None]])
+            # the end takes the place of its cell's centre
+            beside = int(self._cells(self._end[None])[0]) != cell
+            vertices = np.concatenate([vertices[: len(vertices) - (not beside)], self._end[None]])
         if len(cells) > 1 and cells[0] == own and not self._led_astray(start, own, vertices[1]):
             vertices = vertices[1:]  # the centre of the start's own cell may lie behind it
         return np.concatenate([start[None], vertices])
@@ -142,6 +152,8 @@ class PathField:
         """Replace stretches of a path by the longest straight lines that cost no more, until `length` is covered."""
         here, covered = 0, 0.0
         kept, cost = [path[0]], self.distance_at(path)
+        if np.isinf(cost[-1]):  # the end, in a cell in whose centre the disc does not fit
+            cost[-1] = 0.0
         while here < len(path) - 1 and covered < length:
             ahead = here + _LOOK_AHEAD[_LOOK_AHEAD < len(path) - here]
             straight = self.line_cost(np.broadcast_to(path[here], (len(ahead), 2)), path[ahead])
@@ -152,6 +164,15 @@ class PathField:
             here = following
             kept.append(path[here])
         return np.array(kept)
+
+    def _nearest_end(self, center: np.ndarray) -> np.ndarray:
+        """The goal, or where the disc cannot get to it from `center` (2,) the last point on the way where it can."""
+        delta = center - self.goal
+        t = np.linspace(0.0, 1.0, 2 + int(np.linalg.norm(delta) / 0.01)) if np.isfinite(delta).all() else np.ones(1)
+        points = self.goal + t[:, None] * delta
+        clearance = self.occupancy.clearance_at(points)
+        short = np.flatnonzero(clearance < self.radius - (_DIP if clearance[0] >= self.radius else 0.0))
+        return points[min(short[-1] + 1, len(points) - 1)] if len(short) else self.goal
 
     def _given_room(self, points: np.ndarray) -> np.ndarray:
         """Points (K, 2), moved where they lack a hair of room: only the centres of cells are known to be free."""
@@ -213,6 +234,11 @@ class PathField:
         return keeps_room(clearance, self.radius, _DIP)
 
 
+def goal_reach_for(goal_radius: float) -> float:
+    """How far from the goal a path may end [m], so that a robot at its end has reached a goal of that radius [m]."""
+    return max(goal_radius - STANDING, 0.0)
+
+
 def keeps_room(clearance: np.ndarray, radius: float, dip: float) -> np.ndarray:
     """Whether a disc can move where the clearance is (M, S) [m] in order of the way: (M,) bool.
 
@@ -262,10 +288,20 @@ def random_shortcuts(
     return path
 
 
+def grid_cells(occupancy: OccupancyMap) -> int:
+    """How many planning cells a map has: what the time of a search grows with."""
+    rows, cols = _grid_shape(occupancy)
+    return rows * cols
+
+
+def _grid_shape(occupancy: OccupancyMap) -> tuple[int, int]:
+    height, width = (side * occupancy.resolution for side in occupancy.occupied.shape)
+    return max(1, round(height / CELL)), max(1, round(width / CELL))
+
+
 def _cell_centers(occupancy: OccupancyMap) -> tuple[np.ndarray, tuple[int, int]]:
     """Centres (rows * cols, 2) of the planning cells and the shape of their grid."""
-    height, width = (side * occupancy.resolution for side in occupancy.occupied.shape)
-    rows, cols = max(1, round(height / CELL)), max(1, round(width / CELL))
+    rows, cols = _grid_shape(occupancy)
     x = occupancy.origin[0] + (np.arange(cols) + 0.5) * CELL
     y = occupancy.origin[1] + (np.arange(rows) + 0.5) * CELL
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), (rows, cols)

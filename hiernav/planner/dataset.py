@@ -1,7 +1,8 @@
 """Labelled samples for the waypoint generator (paper section IV-A).
 
 One shortest-path field per world labels every start in it. Half of the starts lie anywhere in the field, close to
-obstacles too; the other half lie on the way from such a start to the goal, with the visits made so far.
+obstacles too; the other half lie on the way from such a start to the goal, with the visits made so far. The start
+itself is among the visits of both, as a robot has entered the pixel it stands in before it plans.
 """
 
 from __future__ import annotations
@@ -159,9 +160,8 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
     starts: list[np.ndarray] = []
     labels: list[np.ndarray] = []
     visits: list[VisitMap] = []
-    fresh = VisitMap(occupancy)
     while len(starts) < count:
-        start, seen = _random_start(occupancy, rng), fresh
+        start, seen = _random_start(occupancy, rng), VisitMap(occupancy)
         if len(starts) % 2:
             path = field.waypoints(start, 80, 0.05)
             if path is None:
@@ -171,11 +171,11 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
             start = path[reached] + rng.normal(0.0, _OFF_PATH, 2)
             if not occupancy.clearance_at(start) > _MIN_CLEARANCE:
                 continue
-            seen = VisitMap(occupancy)
             seen.add(path[: reached + 1])
         label = _label(field, start, settings, rng)
         if label is None:
             continue
+        seen.add(start)
         starts.append(start)
         labels.append(label)
         visits.append(seen)

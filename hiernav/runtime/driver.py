@@ -47,7 +47,7 @@ class DriverConfig:
     goal_radius: float = 0.3
     """The goal is reached within this distance of the estimated position [m]."""
     goal_tolerance: float = 0.3
-    """A goal inside an obstacle may be moved this far to a free point [m]."""
+    """A goal inside an obstacle may be moved this far, to where the robot fits or at least to a free point [m]."""
     robot_radius: float = 0.1
     """Disc that must not meet the map [m]."""
     max_steps: int = 300
@@ -347,7 +347,10 @@ class Driver:
                 self._restarts = estimate.restarts
         if supervisor.mode is Mode.READY and trip is not None and not self._paused:
             try:
-                trip.goal = place_goal(occupancy, estimate.pose[:2], trip.goal, self.config.goal_tolerance)
+                config = self.config
+                trip.goal = place_goal(
+                    occupancy, estimate.pose[:2], trip.goal, config.goal_tolerance, config.robot_radius
+                )
             except GoalRefused as refusal:
                 self._end_trip(refusal.code, now, str(refusal))
                 return

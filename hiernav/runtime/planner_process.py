@@ -19,6 +19,7 @@ import scipy.sparse.csgraph  # noqa: F401  by the first search, which the keeper
 from hiernav.nav.goselo import CHANNELS
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner, verified_planner
+from hiernav.nav.search import goal_reach_for
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import mapped
 from hiernav.runtime.planner_memory import PlannerMemory, Reply
@@ -87,13 +88,14 @@ def make_planner(memory: PlannerMemory) -> Planner:
         settings["soft_margin_m"],
         num_waypoints=memory.waypoints,
         spacing=settings["spacing_m"],
+        goal_reach=goal_reach_for(settings["goal_radius"]),
     )
     if not memory.model:
         return expert
     network = OnnxPlannerNetwork(memory.model)
     channels = tuple(settings["channels"]) or CHANNELS
     network(np.zeros((1, len(channels), 64, 64), np.uint8), np.ones(1, np.float32))
-    return verified_planner(network, channels, expert, settings["robot_radius"])
+    return verified_planner(network, channels, expert, settings["robot_radius"], settings["goal_radius"])
 
 
 def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) -> None:

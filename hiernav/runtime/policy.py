@@ -125,19 +125,20 @@ def require_fit(bundle: Bundle, robot: Robot) -> None:
     bundle.require_actions(robot.action_dim)
 
 
-def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float) -> Planner:
+def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float, goal_radius: float = 0.3) -> Planner:
     """The planner a bundle describes: the network on GOSELO images, verified, and repaired by shortest paths.
 
     Args:
         bundle: verified policies.
         network: of that bundle.
         robot_radius: disc with which plans are swept against the map [m].
+        goal_radius: distance at which the goal counts as reached [m].
     """
     plan = bundle.manifest.plan
     expert = ShortestPathPlanner(
         plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
     )
-    return verified_planner(network, bundle.manifest.goselo.channels, expert, robot_radius)
+    return verified_planner(network, bundle.manifest.goselo.channels, expert, robot_radius, goal_radius)
 
 
 def make_agent(
@@ -156,7 +157,7 @@ def make_agent(
     """
     policies, plan, replan = load_policies(bundle), bundle.manifest.plan, bundle.manifest.replan
     option = WaypointOption(
-        planner or make_planner(bundle, policies.planner, robot_radius),
+        planner or make_planner(bundle, policies.planner, robot_radius, goal_radius),
         num_rows=1,
         rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
         num_waypoints=plan.waypoints,

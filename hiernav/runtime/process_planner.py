@@ -13,6 +13,7 @@ import numpy as np
 from hiernav.nav.bundle import Bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import PlanQuery
+from hiernav.nav.search import grid_cells
 from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import mapped, shared_memory
 from hiernav.runtime.pilot import Answer
@@ -21,6 +22,9 @@ from hiernav.runtime.timing import Histogram
 
 LOADING = 5.0
 """Time that a planner which has just been started is given to load its network [s]."""
+SECONDS_PER_CELL = 6e-6
+"""Time for a planning cell of 0.1 m that the first plan on a map may take [s], three times what it takes at 4 GHz:
+0.24 s for 20 x 20 m, 1.5 s for 50 x 50 m, beside what a planner is given on any map."""
 _REMEMBERED = 256
 
 
@@ -35,16 +39,27 @@ class ProcessPlanner:
     """A `PlannerLink` to a process that is started here.
 
     A question is put into a mailbox that holds one: the planner, when it is free, finds the newest. A planner that
-    does not answer for `hang_after` is killed and started again, as is one that has died; three restarts are granted.
+    does not answer for as long as `patience` is killed and started again, as is one that has died; three restarts are
+    granted.
     """
 
-    def __init__(self, bundle: Bundle, robot_radius: float, map_pixels: int, hang_after: float = 0.5) -> None:
+    def __init__(
+        self,
+        bundle: Bundle,
+        robot_radius: float,
+        map_pixels: int,
+        hang_after: float = 0.5,
+        goal_radius: float = 0.3,
+        seconds_per_cell: float = SECONDS_PER_CELL,
+    ) -> None:
         """
         Args:
             bundle: verified policies; the planner gets the bytes that were verified.
             robot_radius: disc with which plans are swept against the map [m].
             map_pixels: of the largest map that will be asked with.
-            hang_after: time without an answer after which the planner is started again [s].
+            hang_after: time without an answer after which the planner is started again [s], on a map of no size.
+            goal_radius: distance at which the goal counts as reached [m].
+            seconds_per_cell: further time for every planning cell of the largest map asked with [s].
         """
         manifest = bundle.manifest
         settings = json.dumps(
@@ -54,11 +69,15 @@ class ProcessPlanner:
                 "spacing_m": manifest.plan.spacing_m,
                 "channels": manifest.goselo.channels,
                 "robot_radius": robot_radius,
+                "goal_radius": goal_radius,
             }
         ).encode()
         waypoints = manifest.plan.waypoints
         self.stamp = 0.0
-        self.hang_after = hang_after
+        self.hang_after, self.seconds_per_cell = hang_after, seconds_per_cell
+        self.patience = hang_after
+        """Time without an answer after which the planner is started again [s]: `hang_after`, and for a search of the
+        largest map asked with so far."""
         self.plan_time = Histogram()
         """How long the planner took, as it says itself."""
         self._descriptor = shared_memory(PlannerMemory.size(map_pixels, waypoints, settings, bundle.planner))
@@ -112,6 +131,8 @@ class ProcessPlanner:
         occupancy, visits = query.occupancy[0], query.visits[0]
         if occupancy is not self._map:
             self._map, self._map_version = occupancy, self._map_version + 1
+            searching = self.seconds_per_cell * grid_cells(occupancy)
+            self.patience = max(self.patience, self.hang_after + searching)
             self._memory.write_map(self._map_version, occupancy)
         if visits is not self._visits:
             visits.count_in(self._memory.visits_of(visits))
@@ -170,6 +191,6 @@ class ProcessPlanner:
             self._silent_since = None
         elif self._silent_since is None:
             self._silent_since = now
-        elif now - self._silent_since > (self.hang_after if self.ready else LOADING):
+        elif now - self._silent_since > (self.patience if self.ready else LOADING):
             self._silent_since = now
             self._child.nudge(b"r")

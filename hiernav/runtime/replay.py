@@ -89,7 +89,8 @@ class Replay:
         if about.robot != bundle.manifest.robot:
             raise LogError(f"{log.path}: a drive of {about.robot!r}, and a bundle for {bundle.manifest.robot!r}")
         self.same_policies = about.hashes == bundle.manifest.files
-        self._planner = make_planner(bundle, load_policies(bundle).planner, about.robot_radius)
+        network = load_policies(bundle).planner
+        self._planner = make_planner(bundle, network, about.robot_radius, about.goal_radius)
         self._asked = _Asked() if about.planner_process else None
         self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked)
         self._agent.recovery = self._recovery = _Recorded(1, self._agent.control_period)

@@ -7,12 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nav_planners import WatchedPlanner, map_with_pillars, query_of
+from numpy.testing import assert_allclose
 
+from hiernav.nav import goselo
 from hiernav.nav.bundle import load_bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import PlanQuery
-from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, StraightPlanner, VerifiedPlanner, apart_from
-from hiernav.nav.search import GOAL_REACH, REFUSALS, PathField
+from hiernav.nav.planners import (
+    GoseloPlanner,
+    ShortestPathPlanner,
+    StraightPlanner,
+    VerifiedPlanner,
+    apart_from,
+    verified_planner,
+)
+from hiernav.nav.search import CELL, GOAL_REACH, REFUSALS, PathField, goal_reach_for, keeps_room
 from hiernav.runtime.policy import load_policies
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.walk import walk
@@ -136,6 +145,53 @@ def test_a_goal_a_little_too_close_to_a_wall_is_gone_to_as_near_as_the_disc_fits
     assert occupancy.is_free(plan, 0.1).all()
     assert np.linalg.norm(plan[-1] - goal) < GOAL_REACH
     assert PathField(occupancy, np.array([0.9, 0.0]), 0.1).waypoints(np.array([0.0, 0.0])) is None
+
+
+@pytest.mark.parametrize("goal_radius", [0.2, 0.3])
+@pytest.mark.parametrize("wall", [24, 27, 30])  # from x = 0.2, 0.35 or 0.5 m on
+def test_a_plan_ends_where_the_goal_counts_as_reached_with_room_to_spare(goal_radius: float, wall: int) -> None:
+    """However deep the goal lies in the wall: within the goal's radius less 0.1 m, or it is refused."""
+    occupancy, reach, planned = walled(slice(wall, None)), goal_reach_for(goal_radius), 0
+    start = np.array([-0.7, 0.0])
+    for x in np.arange(0.0, 0.8, 0.01):
+        planner = verified_planner(StraightAhead(), goselo.CHANNELS, ShortestPathPlanner(0.1), 0.1, goal_radius)
+        query, depth = query_of([start], [(x, 0.0)], occupancy), x - (-1.0 + 0.05 * wall - 0.1)
+        end = planner.repair.field(occupancy, query.goal[0]).path_from(start)
+        if end is None:
+            assert depth > reach - 0.05 and planner.repair.refusal(query, 0) == "goal_blocked"
+            continue
+        planned += 1
+        assert np.linalg.norm(end[-1] - query.goal[0]) <= reach
+        assert occupancy.clearance_at(end[-1]) >= 0.1 - 1e-9
+        assert np.linalg.norm(end[-1] - query.goal[0]) <= max(depth, 0.0) + 0.05, "about as near as it fits"
+        near = planner.repair.field(occupancy, query.goal[0]).waypoints(end[-1] - [0.3, 0.0])
+        assert_allclose(near[-1], end[-1], atol=0.005)
+    assert planned > 15
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.2])
+def test_a_goal_with_room_in_a_cell_without_is_the_end_of_its_paths(radius: float) -> None:
+    ends = 0
+    for layout in layouts_of("pillar(4,4,40)", 4, radius):
+        occupancy = layout.occupancy(0.0)
+        for goal in np.random.default_rng(3).uniform(-4.0, 4.0, (120, 2)):
+            center = (np.floor(goal / CELL) + 0.5) * CELL
+            if occupancy.clearance_at(goal) >= radius > occupancy.clearance_at(center):
+                field = PathField(occupancy, goal, radius)
+                path = field.path_from(layout.start[:2])
+                if path is not None:
+                    ends += 1
+                    assert np.linalg.norm(path[-1] - goal) <= 0.05
+                    assert keeps_room(occupancy.clearance_at(path[-2:])[None], radius, 0.015)[0]
+    assert ends > 2
+
+
+class StraightAhead:
+    """A network of one hypothesis: straight to the goal."""
+
+    def __call__(self, image: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ahead = 0.1 * np.arange(1, 11)[None, None, :, None] * np.array([0.0, 1.0])
+        return np.repeat(ahead, len(image), axis=0), np.zeros((len(image), 1))
 
 
 # hysteresis

@@ -13,10 +13,11 @@ import pytest
 from puck import GOAL, Listener, Puck, driver_of, pilot_for
 from shipped import open_shipped
 
-from hiernav.nav.occupancy import VisitMap, empty_map
+from hiernav.nav.occupancy import OccupancyMap, VisitMap, empty_map
 from hiernav.nav.option import PlanQuery
 from hiernav.nav.planners import StraightPlanner
-from hiernav.runtime.process_planner import ProcessPlanner
+from hiernav.nav.search import grid_cells
+from hiernav.runtime.process_planner import SECONDS_PER_CELL, ProcessPlanner
 from hiernav.runtime.supervisor import Mode
 
 FAR = np.array([1.9, 0.0])
@@ -69,11 +70,19 @@ def planner() -> Iterator[ProcessPlanner]:
     made.close()
 
 
-def ask(planner: ProcessPlanner, patience: float = 60.0) -> object:
+def query_on(occupancy: OccupancyMap) -> PlanQuery:
+    return PlanQuery(np.zeros((1, 2)), GOAL[None], [occupancy], [VisitMap(occupancy)], np.full((1, 10, 2), np.nan))
+
+
+def ask_once(planner: ProcessPlanner, occupancy: OccupancyMap) -> None:
+    planner.plan(query_on(occupancy))
+
+
+def ask(planner: ProcessPlanner, patience: float = 60.0, query: PlanQuery = QUERY) -> object:
     """Ask until there is an answer, as the loop does."""
     end = time.monotonic() + patience
     while time.monotonic() < end and planner.failed is None:
-        planner.plan(QUERY)
+        planner.plan(query)
         time.sleep(0.01)
         answer = planner.answer(time.monotonic())
         if answer is not None:
@@ -95,3 +104,27 @@ def test_a_hanging_process_is_replaced_three_times_and_then_given_up(planner):
     while planner.failed is not None and time.monotonic() < end:
         time.sleep(0.01)
     assert ask(planner) is not None and planner.restart_count() == 1
+
+
+def test_a_planner_is_given_the_longer_the_larger_the_map_is():
+    made = ProcessPlanner(open_shipped("point"), 0.1, 1_000_000, hang_after=0.5)
+    try:
+        assert made.patience == 0.5
+        for half_size, searching in ((2.0, 1600), (25.0, 250_000), (2.0, 250_000)):
+            ask_once(made, empty_map((half_size, half_size)))
+            assert made.patience == pytest.approx(0.5 + SECONDS_PER_CELL * searching)
+        assert grid_cells(empty_map((40.0, 40.0), 0.2)) == 640_000, "whatever its pixels"
+        assert SECONDS_PER_CELL * 640_000 > 3.0
+    finally:
+        made.close()
+
+
+def test_the_first_plan_on_a_large_map_comes_although_the_search_takes_longer_than_a_planner_hangs():
+    large = empty_map((10.0, 10.0))
+    made = ProcessPlanner(open_shipped("point"), 0.1, large.occupied.size, hang_after=0.02, seconds_per_cell=1e-3)
+    try:
+        assert ask(made, query=query_on(large)) is not None
+        assert made.restart_count() == 0
+        assert made.plan_time.max > 0.02
+    finally:
+        made.close()
