@@ -1,7 +1,7 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
 Exit codes: 0 done; 1 training diverged or lost its workers, a replay differs, or a result is damaged; 2 bad input, with
-one line that says what to do; 130 interrupted.
+one line that says what to do; 130 interrupted; 141 nobody reads the output any more; 143 interrupted by SIGTERM.
 """
 
 from __future__ import annotations
@@ -9,11 +9,16 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
+import select
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from hiernav.run import TrainingDiverged, WorkersLost
@@ -23,8 +28,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from hiernav.config import TrainConfig
+    from hiernav.sim.layout import WorldSpec
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILED, BAD_INPUT, INTERRUPTED, UNREAD, TERMINATED = 1, 2, 130, 141, 143
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM arrived, as from systemd, Slurm, Docker or `timeout`: all that Ctrl-C does is to happen."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,11 +46,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.error(f"unrecognized arguments: {' '.join(more)}")
         arguments.overrides += more  # argparse itself takes one group of KEY=VALUE, but no second one after an option
     try:
-        return arguments.run(arguments) or 0
-    except KeyboardInterrupt:
+        with _sigterm_as_ctrl_c():
+            code = arguments.run(arguments) or 0
+            sys.stdout.flush()  # here, where a pipe that nobody reads can still be told from all else
+            return code
+    except KeyboardInterrupt as error:
         print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _interruption(error)
     except (ValueError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and _reader_is_gone():
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more as it ends
+            return UNREAD
         print(f"hiernav {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
     except (TrainingDiverged, WorkersLost) as error:
@@ -53,6 +69,45 @@ def main(argv: Sequence[str] | None = None) -> int:
         how = f"`pip install -e '.[{extra}]'` in the checkout installs it"
         print(f"hiernav {arguments.command}: needs {error.name}: {how}", file=sys.stderr)
         return BAD_INPUT
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Raise `Terminated` where SIGTERM arrives, so that nothing is left half done; in the main thread alone."""
+    before = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or before not in (
+        signal.SIG_DFL,
+        signal.default_int_handler,
+    ):
+        yield  # whoever ignores or handles it already has a reason
+        return
+    owner = os.getpid()
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        if os.getpid() != owner:  # a fork of this process, such as a worker: it ends as if it had no handler
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _interruption(error: KeyboardInterrupt) -> int:
+    return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
+
+
+def _reader_is_gone() -> bool:
+    """Whether the standard output is a pipe or socket that nobody reads any more."""
+    poll = select.poll()
+    try:
+        poll.register(sys.stdout.fileno(), 0)
+    except (OSError, ValueError):
+        return False
+    return any(state & (select.POLLERR | select.POLLHUP) for _, state in poll.poll(0))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -259,10 +314,10 @@ def _train(arguments: argparse.Namespace) -> int:
     try:
         with _progress() as progress:
             train(run, arguments.stage, progress)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         again = f"hiernav train --resume {run.path}" + (arguments.stage != "all") * f" --stage {arguments.stage}"
         print(f"stopped; go on from the last checkpoint with: {again}", file=sys.stderr)
-        return INTERRUPTED
+        return _interruption(error)
     finally:
         run.close()
     if run.config.skill.preset == "baseline":
@@ -272,11 +327,24 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
-    from hiernav.evaluate import EPISODES, evaluate, open_policies
+def _worlds(arguments: argparse.Namespace) -> list[WorldSpec]:
+    """Those of `--world`, each once, in the order of their first mention, with a `--seed` that can decide them.
+
+    Raises:
+        ValueError: there is no such world, or the seed is negative.
+    """
     from hiernav.sim.layout import parse_world
 
-    worlds = [parse_world(text) for text in arguments.world or ["pillar(2,2,10)"]]
+    if arguments.seed < 0:
+        raise ValueError(f"--seed is {arguments.seed}, it must not be negative")
+    worlds = (parse_world(text) for text in arguments.world or ["pillar(2,2,10)"])
+    return list({str(world): world for world in worlds}.values())
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from hiernav.evaluate import EPISODES, evaluate, open_policies
+
+    worlds = _worlds(arguments)
     policies = open_policies(arguments.bundle or arguments.run_path)
     robot = policies.config.robot
     if arguments.robot and arguments.robot != robot:
@@ -321,9 +389,8 @@ def _watch(arguments: argparse.Namespace) -> int:
     from hiernav.film.film import FilmSettings, film_name, make_film
     from hiernav.film.writer import SUFFIXES, default_suffix
     from hiernav.run import newest_run
-    from hiernav.sim.layout import parse_world
 
-    worlds = [parse_world(text) for text in arguments.world or ["pillar(2,2,10)"]]
+    worlds = _worlds(arguments)
     settings = FilmSettings(arguments.view, arguments.lidar, arguments.size, arguments.speed, arguments.fps)
     if arguments.run_path and arguments.bundle:
         raise ValueError("a run and a bundle at once: leave out one of them")
@@ -465,6 +532,9 @@ def _dataset(arguments: argparse.Namespace) -> int:
 def _report(arguments: argparse.Namespace) -> int:
     from hiernav.report.page import write_report
 
+    for option, file in (("--out", arguments.out), ("--curves", arguments.curves)):
+        if file is not None and file.is_dir():
+            raise ValueError(f"{option} {file} is a folder: name a file in it")
     book = write_report(arguments.results, arguments.out)
     failed = sum(result.state == "failed" for result in book.results)
     size = arguments.out.stat().st_size / 1e6
@@ -634,7 +704,11 @@ def _console(stderr: bool = False, piped_width: int = 120) -> Console:
     """As wide as the terminal, or as `piped_width` columns where there is none."""
     from rich.console import Console
 
-    console = Console(stderr=stderr)
+    class Screen(Console):
+        def on_broken_pipe(self) -> None:
+            raise  # called while BrokenPipeError is handled: rich itself would exit with code 1
+
+    console = Screen(stderr=stderr)
     if not console.is_terminal:
         console.width = piped_width
     return console

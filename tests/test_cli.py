@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -86,6 +87,7 @@ def test_a_configuration_that_cannot_be_used_is_named_by_file_and_key(refused, t
         ("skill.num_envs=0", "command line: skill.num_envs = 0, expected int >= 1"),
         ("skil.tau=1", "command line: unknown key 'skil.tau', did you mean 'skill.tau'?"),
         ("tau", "command line: 'tau', expected key.path=value"),
+        ("planner=5", "command line: 'planner' is a section: set a key of it, such as 'planner."),
         ("robot=ant", "command line: robot = 'ant', expected car | doggo | point"),
         (
             "skill.worlds=['pillar(2,2)']",
@@ -349,14 +351,15 @@ sys.exit(main(["train", "run_dir=run"]))
 
 
 @pytest.mark.train
-def test_ctrl_c_stops_training_with_how_to_go_on_and_going_on_works(tmp_path, capsys):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_sigterm_stop_training_with_how_to_go_on_and_going_on_works(tmp_path, capsys, number, code):
     settings = ("skill.total_steps=7680", "skill.eval_every_steps=7680")
     run = tmp_path / "run"
     train = start("train", "--stage", "skill", *tiny_run.arguments(run, *settings))
     await_file(run / "skill" / "checkpoint.pt", train)
-    train.send_signal(signal.SIGINT)
+    train.send_signal(number)
     _, errors = train.communicate(timeout=60)
-    assert train.returncode == 130, errors
+    assert train.returncode == code, errors
     assert errors.rstrip().splitlines()[-1] == (
         f"stopped; go on from the last checkpoint with: hiernav train --resume {run} --stage skill"
     )
@@ -378,6 +381,66 @@ def test_ctrl_c_in_the_middle_of_a_librarys_bookkeeping_is_ctrl_c(tmp_path, caps
     monkeypatch.setattr("hiernav.skill.train.SkillTrainer.train", interrupted)
     assert cli.main(["train", "--stage", "skill", *tiny_run.arguments(tmp_path / "run")]) == 130
     assert "stopped; go on from the last checkpoint" in capsys.readouterr().err
+
+
+def test_sigterm_cleans_up_like_ctrl_c(tmp_path, capsys, monkeypatch):
+    import hiernav.draw
+
+    def drawing(_layout: object, file: Path) -> None:
+        file.write_text("half")
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10.0)
+        finally:
+            file.unlink()
+
+    monkeypatch.setattr(hiernav.draw, "draw_layout", drawing)
+    before = signal.getsignal(signal.SIGTERM)
+    assert cli.main(["world", "--png", str(tmp_path / "w.png")]) == 143
+    assert capsys.readouterr().err == "interrupted\n"
+    assert list(tmp_path.iterdir()) == [] and signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize("arguments", [["world", "--kind", "pillar(100,100,2000)"], ["config"], ["config", "seed=1"]])
+def test_a_pipe_that_nobody_reads_is_no_bad_input(arguments):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "hiernav", *arguments]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_broken_pipe_elsewhere_is_told(refused, monkeypatch):
+    def broken(*_: object) -> None:
+        raise BrokenPipeError(32, "a worker is gone")
+
+    monkeypatch.setattr("hiernav.sim.worlds.sample_layout", broken)
+    assert "a worker is gone" in refused("world")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "watch"])
+def test_a_negative_seed_is_refused_by_name_and_value(refused, command):
+    assert "--seed is -3, it must not be negative" in refused(command, "--bundle", "nowhere", "--seed", -3)
+
+
+def test_a_world_that_is_named_twice_is_driven_once(able_bundle, capsys, monkeypatch):
+    asked: list[list[str]] = []
+
+    def watched(policies: object, worlds: list[object], *_: object, **__: object) -> dict[str, object]:
+        asked.append([str(world) for world in worlds])
+        return {}
+
+    monkeypatch.setattr("hiernav.evaluate.evaluate", watched)
+    worlds = ["--world", "gremlin", "--world", "two-room", "--world", "gremlin"]
+    assert cli.main(["evaluate", "--bundle", str(able_bundle), *worlds, "--json", "-"]) == 0
+    assert [text.partition("(")[0] for text in asked[0]] == ["gremlin", "two-room"]
+
+
+@pytest.mark.parametrize(("option", "folder"), [("--out", "."), ("--out", "results"), ("--curves", ".")])
+def test_a_folder_in_the_place_of_a_file_of_the_report_is_refused(refused, tmp_path, option, folder):
+    (tmp_path / "results").mkdir()
+    assert f"{option} {folder} is a folder: name a file in it" in refused("report", option, folder)
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

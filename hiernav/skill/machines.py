@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 import warnings
 from functools import partial
 from typing import Any, Protocol
@@ -132,6 +133,7 @@ class Cluster:
             # Ray ranks workers behind all else on a machine; here the trainer waits for them
             os.environ.setdefault("RAY_worker_niceness", "0")
             address = config.skill.ray_address
+            sigterm = signal.getsignal(signal.SIGTERM)
             try:
                 ray.init(address, include_dashboard=False, logging_level=logging.WARNING)
             except (ConnectionError, ray.exceptions.AuthenticationError) as error:
@@ -139,6 +141,10 @@ class Cluster:
                     f"skill.ray_address = {address!r}: {str(error).strip()}; is `ray start --head` running there, and "
                     "are its token and RAY_AUTH_MODE set here? (see docs/cluster.md)"
                 ) from error
+            finally:
+                # Ray would have SIGTERM end this process with a code of its own, and no word on how to go on
+                if threading.current_thread() is threading.main_thread():
+                    signal.signal(signal.SIGTERM, sigterm)
         there, needed = int(ray.cluster_resources().get("CPU", 0)), config.skill.workers * config.threads
         if there < needed:
             self.close()
