@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 
+from hiernav import __version__
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import RESOLUTION
@@ -138,6 +139,7 @@ def _join_goal(argv: Sequence[str]) -> list[str]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--version", action="version", version=__version__)
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--realtime", action="store_true", help="at the robot's control rate (default)")
     pace.add_argument("--fast", action="store_true", help="as fast as the machine can; the same for the same seed")
