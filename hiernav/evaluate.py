@@ -20,6 +20,7 @@ import numpy as np
 
 from hiernav.config import OptionConfig, TrainConfig, load_config
 from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
+from hiernav.nav.occupancy import RESOLUTION
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
 from hiernav.runtime.policy import load_policies
@@ -253,6 +254,10 @@ def _from_bundle(path: Path) -> Policies:
     bundle = load_bundle(path)
     robot = get_robot(bundle.manifest.robot)
     bundle.require_robot(robot.name, file_sha256(robot.xml_path))
+    bundle.require_period(robot.control_period)
+    bundle.require_actions(robot.action_dim)
+    bundle.require_resolution(RESOLUTION)
+    loaded = load_policies(bundle)
     manifest, terms = bundle.manifest, bundle.layout.names
     skill = "default" if "waypoints" in terms else "baseline"
     presets = load_config(
@@ -277,7 +282,6 @@ def _from_bundle(path: Path) -> Policies:
         skill=msgspec.structs.replace(presets.skill, clock="clock" in terms),
     )
     bundle.require_layout(skill_layout(config))
-    loaded = load_policies(bundle)
     return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels, knows_reward=False)
 
 

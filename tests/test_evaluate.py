@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,14 +23,16 @@ from hiernav.evaluate import (
     summarize,
     wilson_interval,
 )
-from hiernav.nav.bundle import BundleError
+from hiernav.nav.bundle import MANIFEST, BundleError
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import TerminationReason
 from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
 from hiernav.run import RunError
 from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode
 
+POINT_BUNDLE = Path(__file__).parents[1] / "deploy" / "bundles" / "point"
 WORLD = parse_world(tiny_run.WORLD)
 REASONS = [reason.name.lower() for reason in TerminationReason if reason]
 
@@ -314,3 +318,26 @@ def test_a_bundle_for_another_model_of_the_robot_is_refused(able_bundle: Path, m
     monkeypatch.setattr("hiernav.evaluate.file_sha256", lambda path: "0" * 64)
     with pytest.raises(BundleError, match="robot_sha256: the model of 'point' has changed since training"):
         open_policies(able_bundle)
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "message"),
+    [
+        ("control_period_s", 0.04, "control_period_s: 0.04 s in the bundle, 0.02 s on this robot"),
+        ("map_resolution_m", 0.1, "map_resolution_m: 0.1 m in the bundle, 0.05 m in the runtime"),
+        ("plan", None, "plan.waypoints: 10 in the network, 9 in the manifest"),
+    ],
+)
+def test_a_bundle_that_assumes_another_rate_map_or_plan_is_not_measured(tmp_path: Path, field, wrong, message):
+    folder = Path(shutil.copytree(POINT_BUNDLE, tmp_path / "bundle"))
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest[field] = manifest[field] | {"waypoints": 9} if wrong is None else wrong
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(BundleError, match=message):
+        open_policies(folder)
+
+
+def test_a_bundle_with_another_number_of_actions_is_not_measured(monkeypatch):
+    monkeypatch.setattr("hiernav.evaluate.get_robot", lambda name: replace(get_robot(name), action_dim=3))
+    with pytest.raises(BundleError, match="actions: 2 in the bundle, 3 on this robot"):
+        open_policies(POINT_BUNDLE)

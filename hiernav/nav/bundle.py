@@ -31,8 +31,12 @@ GOLDEN_NAMES = ("observation", "action", "image", "distance", "waypoints", "scor
 _GOLDEN_RANKS = {"observation": 2, "action": 2, "image": 4, "distance": 1, "waypoints": 4, "scores": 2}
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+# Bounds far beyond any robot, below which nothing overflows and no array takes the memory.
+Size = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+Seconds = Annotated[float, msgspec.Meta(ge=1e-4, le=100.0)]
+Length = Annotated[float, msgspec.Meta(ge=1e-4, le=1000.0)]
+Margin = Annotated[float, msgspec.Meta(ge=0.0, le=1000.0)]
 Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
@@ -66,14 +70,14 @@ class PlannerSpec(_Struct, frozen=True):
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
     preset: str
-    channels: Count
+    channels: Size
 
 
 class ObservationField(_Struct, frozen=True):
     """One term of the observation, as `ObservationTerm`."""
 
     name: str
-    size: Count
+    size: Size
     unit: str
     scale: float
 
@@ -81,19 +85,20 @@ class ObservationField(_Struct, frozen=True):
 class GoseloSpec(_Struct, frozen=True):
     """How the planner's images are made."""
 
-    pixels: Count
+    pixels: Size
     channels: tuple[str, ...]
-    local_side_m: Positive
+    local_side_m: Length
 
 
 class PlanSpec(_Struct, frozen=True):
     """What a plan looks like."""
 
-    waypoints: Count
-    spacing_m: Positive
-    planning_radius_m: Positive
+    waypoints: Annotated[int, msgspec.Meta(ge=2, le=100)]
+    """As `option.waypoints` of a training."""
+    spacing_m: Length
+    planning_radius_m: Length
     """Disc that must fit on a plan."""
-    soft_margin_m: NonNegative
+    soft_margin_m: Margin
     """Further clearance worth a detour when a plan is repaired."""
 
 
@@ -119,8 +124,8 @@ class Manifest(_Struct, frozen=True, kw_only=True):
     robot: str
     robot_sha256: Sha256
     """Of the robot's model file."""
-    control_period_s: Positive
-    map_resolution_m: Positive
+    control_period_s: Seconds
+    map_resolution_m: Length
     files: dict[str, Sha256] = {}
     """Filled in by `write_manifest`."""
     opset: int = 0

@@ -90,9 +90,7 @@ def images(
         ValueError: a channel has another name.
     """
     plan = [channel.rpartition("_")[::2] for channel in channels]
-    for name, (source, crop) in zip(channels, plan, strict=True):
-        if source not in _SOURCES or crop not in _SIDES:
-            raise ValueError(f"GOSELO channel {name!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
+    check_channels(channels)
     out = np.empty((len(frame.position), len(channels), PIXELS, PIXELS), dtype=np.uint8)
     # plain floats: arrays of two numbers would take longer than the crops
     rows = zip(frame.position.tolist(), frame.up.tolist(), frame.distance.tolist(), strict=True)
@@ -109,6 +107,14 @@ def images(
                 outside=255 if source == "obstacles" else 0,
             )
     return out
+
+
+def check_channels(channels: Sequence[str]) -> None:
+    """Raise ValueError for a channel that `images` does not know."""
+    for name in channels:
+        source, _, crop = name.rpartition("_")
+        if source not in _SOURCES or crop not in _SIDES:
+            raise ValueError(f"GOSELO channel {name!r}: expected one of {_SOURCES} with one of {tuple(_SIDES)}")
 
 
 _LONGEST = 128

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, TensorSpec
+from hiernav.nav import goselo
+from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, TensorSpec
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
 from hiernav.runtime.robot import Robot
@@ -77,6 +78,10 @@ class OnnxPlannerNetwork:
                 "distance (M) float -> waypoints (M, H, K, 2) float, scores (M, H) float"
             )
         self.channels = _known(inputs[0], 1, PLANNER)
+        self.waypoints = _known(outputs[0], 2, PLANNER)
+        pixels = (_known(inputs[0], 2, PLANNER), _known(inputs[0], 3, PLANNER))
+        if pixels != (goselo.PIXELS, goselo.PIXELS) or _known(outputs[0], 3, PLANNER) != 2:
+            raise BundleError(f"{PLANNER}: {_signature(self._session)}; expected 64 by 64 pixels and waypoints (K, 2)")
         self._image_dtype = _DTYPES[inputs[0].type]
         self._inputs = [each.name for each in inputs]
         self._outputs = [each.name for each in outputs]
@@ -99,11 +104,12 @@ class Policies:
 
 
 def load_policies(bundle: Bundle) -> Policies:
-    """Load both networks, check them against the manifest and on the golden inputs.
+    """Load both networks, check them against the manifest and on the golden inputs, and the manifest against what is
+    done here with both.
 
     Raises:
         BundleError: a network does not load, has other inputs or outputs than the manifest says, or gives other values
-            than it did when it was exported.
+            than it did when it was exported; images or plans are not made here as the manifest says.
     """
     policies = Policies(OnnxSkill(bundle.skill), OnnxPlannerNetwork(bundle.planner))
     manifest = bundle.manifest
@@ -112,11 +118,37 @@ def load_policies(bundle: Bundle) -> Policies:
     for what, ours, theirs in (
         ("observation size", policies.skill.observation_size, bundle.layout.size),
         ("planner channels", policies.planner.channels, manifest.planner.channels),
+        ("plan.waypoints", policies.planner.waypoints, manifest.plan.waypoints),
+        ("number of goselo.channels", policies.planner.channels, len(manifest.goselo.channels)),
     ):
         if ours != theirs:
             raise BundleError(f"{what}: {ours} in the network, {theirs} in the manifest")
+    _require_images(manifest.goselo)
+    _require_waypoints(bundle)
     check_golden(bundle, policies)
     return policies
+
+
+def _require_images(spec: GoseloSpec) -> None:
+    """BundleError unless the planner is shown the images that it was trained on."""
+    if spec.pixels != goselo.PIXELS:
+        raise BundleError(f"goselo.pixels: {spec.pixels} in the bundle, {goselo.PIXELS} in the runtime")
+    if not abs(spec.local_side_m - goselo.LOCAL_SIDE) <= 1e-9:
+        raise BundleError(
+            f"goselo.local_side_m: {spec.local_side_m:g} m in the bundle, {goselo.LOCAL_SIDE:g} m in the runtime"
+        )
+    try:
+        goselo.check_channels(spec.channels)
+    except ValueError as error:
+        raise BundleError(f"goselo.channels: {error}") from None
+
+
+def _require_waypoints(bundle: Bundle) -> None:
+    """BundleError unless the skill observes as many waypoints as a plan has; a baseline observes none."""
+    count = bundle.manifest.plan.waypoints
+    for term in bundle.layout.terms:
+        if term.name == "waypoints" and term.size != 2 * count:
+            raise BundleError(f"plan.waypoints: {count} in a plan, the skill observes {term.size / 2:g}")
 
 
 def require_fit(bundle: Bundle, robot: Robot) -> None:

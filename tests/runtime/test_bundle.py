@@ -100,6 +100,10 @@ def test_a_newer_format_asks_for_an_upgrade_even_with_fields_unknown_here(folder
         b.load_bundle(folder)
 
 
+GOSELO = {"pixels": 64, "channels": ["obstacles_1", "obstacles_2", "obstacles_4"], "local_side_m": 3.2}
+PLAN = {"waypoints": 10, "spacing_m": 0.1, "planning_radius_m": 0.1, "soft_margin_m": 0.15}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -107,6 +111,16 @@ def test_a_newer_format_asks_for_an_upgrade_even_with_fields_unknown_here(folder
         ({"surprise": 1}, "surprise"),
         ({"control_period_s": 0.0}, "control_period_s"),
         ({"control_period_s": "fast"}, "control_period_s"),
+        ({"control_period_s": 1e-300}, "control_period_s"),
+        ({"control_period_s": 1e300}, "control_period_s"),
+        ({"map_resolution_m": 1e300}, "map_resolution_m"),
+        ({"goselo": GOSELO | {"pixels": 10**9}}, "pixels"),
+        ({"goselo": GOSELO | {"local_side_m": 1e300}}, "local_side_m"),
+        ({"plan": PLAN | {"waypoints": 10**9}}, "waypoints"),
+        ({"plan": PLAN | {"spacing_m": 1e-300}}, "spacing_m"),
+        ({"plan": PLAN | {"planning_radius_m": 1e300}}, "planning_radius_m"),
+        ({"plan": PLAN | {"soft_margin_m": 1e300}}, "soft_margin_m"),
+        ({"observation": [{"name": "gyro", "size": 10**9, "unit": "rad/s", "scale": 1.0}]}, "size"),
         ({"robot_sha256": "xyz"}, "robot_sha256"),
         ({"provenance": {"nested": {}}}, "provenance"),
     ],
@@ -343,6 +357,14 @@ METHOD, FLAGS = 8, 6
 def test_a_golden_file_that_is_packed_in_another_way_is_refused(folder, offset, value, reason):
     replace_file(folder, b.GOLDEN, zip_field(golden_zip(folder), offset, value))
     with pytest.raises(b.BundleError, match=f"golden.npz: .*{reason}"):
+        b.load_bundle(folder)
+
+
+def test_a_golden_file_that_cannot_be_inflated_is_refused(folder):
+    data = bytearray(golden_zip(folder))
+    data[data.find(b"PK\x03\x04") + 30 + len("observation.npy")] = 0x07  # no kind of block of deflate
+    replace_file(folder, b.GOLDEN, bytes(data))
+    with pytest.raises(b.BundleError, match="golden.npz: damaged .*invalid block type"):
         b.load_bundle(folder)
 
 

@@ -143,3 +143,33 @@ def test_a_planner_that_answers_in_another_type_is_refused():
     model.graph.output[1].type.tensor_type.elem_type = TensorProto.STRING
     with pytest.raises(b.BundleError, match=r"planner.onnx: .*expected .*scores \(M, H\) float"):
         OnnxPlannerNetwork(model.SerializeToString())
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "wrong", "message"),
+    [
+        ("goselo", "local_side_m", 7.0, r"goselo.local_side_m: 7 m in the bundle, 3.2 m in the runtime"),
+        ("goselo", "pixels", 128, "goselo.pixels: 128 in the bundle, 64 in the runtime"),
+        ("goselo", "channels", ["a"], "number of goselo.channels: 3 in the network, 1 in the manifest"),
+        ("goselo", "channels", [], "number of goselo.channels: 3 in the network, 0 in the manifest"),
+        ("goselo", "channels", ["obstacles_1", "a", "b"], "goselo.channels: GOSELO channel 'a': expected one of"),
+        ("plan", "waypoints", 9, "plan.waypoints: 10 in the network, 9 in the manifest"),
+        ("planner", "channels", 4, "planner channels: 3 in the network, 4 in the manifest"),
+    ],
+)
+def test_a_manifest_that_the_runtime_would_not_keep_to_is_refused(tmp_path, part, field, wrong, message):
+    write_bundle(tmp_path)
+    path = tmp_path / b.MANIFEST
+    fields = json.loads(path.read_text())
+    fields[part][field] = wrong
+    path.write_text(json.dumps(fields))
+    with pytest.raises(b.BundleError, match=message):
+        load_policies(b.load_bundle(tmp_path))
+
+
+def test_a_skill_that_observes_another_number_of_waypoints_than_a_plan_has_is_refused(tmp_path):
+    fields = (("waypoints", 4), ("gyro", 1))
+    layout = tuple(b.ObservationField(name=name, size=size, unit="m", scale=1.0) for name, size in fields)
+    write_bundle(tmp_path, observation=layout)
+    with pytest.raises(b.BundleError, match="plan.waypoints: 10 in a plan, the skill observes 2"):
+        load_policies(b.load_bundle(tmp_path))
