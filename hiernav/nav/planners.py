@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import arc_lengths, polyline
 from hiernav.nav.search import CELL, GOAL_REACH, PathField, goal_reach_for, keeps_room
+from hiernav.nav.sweep import leads_out, places
 
 CACHED_CELLS = 500_000
 """Of all shortest-path fields that a planner keeps: about 80 MB, and 64 maps of up to 8.8 x 8.8 m."""
@@ -26,8 +26,6 @@ _FARTHEST = 100.0
 _DIP = 0.15 * CELL
 """What a shortest path may lack of its radius [m]: the disc is known to fit at the centres of cells, and between two of
 them the clearance may be lower."""
-_SPACING = 0.05
-"""At which plans are swept [m]."""
 _TIGHTNESS = 4.0
 """Score that a hypothesis loses which leaves nothing beyond the radius."""
 
@@ -222,7 +220,7 @@ class VerifiedPlanner:
         radius = min(self.radius, self.repair.radius)
         fits = np.isfinite(repaired).all(axis=(1, 2))
         for row in np.flatnonzero(fits).tolist():
-            points, _ = _sampled(query.position[row][None], repaired[row][None], _SPACING)
+            points = places(polyline(query.position[row][None], repaired[row][None]))[0]
             fits[row] = keeps_room(query.occupancy[row].clearance_at(points), radius, _DIP)[0]
         return fits
 
@@ -258,9 +256,7 @@ def apart_from(previous: np.ndarray, position: np.ndarray, candidates: np.ndarra
     return (apart * left).sum(axis=-1) / left.sum(axis=-1)
 
 
-def swept_clearance(
-    start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap, spacing: float = _SPACING
-) -> np.ndarray:
+def swept_clearance(start: np.ndarray, plans: np.ndarray, occupancy: OccupancyMap) -> np.ndarray:
     """Smallest clearance on the way along plans, beyond what the start itself lacks.
 
     The first 0.15 m do not count where they lead away from an obstacle that the robot already stands too close to.
@@ -273,25 +269,11 @@ def swept_clearance(
         (M,) [m].
     """
     finite = (np.abs(plans - start[:, None]) <= _FARTHEST).all(axis=(1, 2))
-    points, arc = _sampled(start, np.where(finite[:, None, None], plans, start[:, None]), spacing)
+    points, arc, _ = places(polyline(start, np.where(finite[:, None, None], plans, start[:, None])))
     clearance = occupancy.clearance_at(points)
-    ahead, escape = clearance[:, 1:], clearance[:, :1]
-    excused = (arc < 0.15 - 1e-9) & (ahead >= clearance[:, :-1] - 1e-6) & (ahead >= escape - 1e-6)
     # the start itself is where the robot is, whatever the plan
-    return np.where(finite, np.where(excused, np.inf, ahead).min(axis=1, initial=np.inf), np.nan)
-
-
-def _sampled(start: np.ndarray, plans: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points along plans from their starts on, at most `spacing` [m] apart: (M, S, 2), and arc lengths (M, S - 1)."""
-    line = polyline(start, plans)
-    steps = np.diff(line, axis=1)
-    lengths = np.sqrt((steps * steps).sum(axis=-1))
-    # as many pieces of every step as the longest one needs
-    pieces = max(1, math.ceil(lengths.max(initial=0.0) / spacing - 1e-6))
-    t = np.arange(pieces) / pieces
-    points = line[:, :-1, None] + t[:, None] * steps[:, :, None]
-    points = np.concatenate([points.reshape(len(line), -1, 2), line[:, -1:]], axis=1)
-    return points, np.cumsum(np.repeat(lengths / pieces, pieces, axis=1), axis=1)
+    ahead = np.where(leads_out(clearance, arc), np.inf, clearance[:, 1:])
+    return np.where(finite, ahead.min(axis=1, initial=np.inf), np.nan)
 
 
 def verified_planner(

@@ -240,7 +240,7 @@ def test_a_much_better_score_is_a_cause_to_change_sides() -> None:
 def test_the_shipped_network_keeps_to_its_side_of_obstacles(network: GoseloPlanner) -> None:
     """A robot that stands, with a pose that is 5 cm wrong, before the worlds' obstacles: plans end where they did."""
     changed = {True: 0, False: 0}
-    for layout in layouts_of("pillar(3,3,25)", 60, 0.1):
+    for layout in layouts_of("pillar(3,3,25)", 180, 0.1):
         occupancy, goal = layout.occupancy(0.0), layout.goal[None]
         for remember in changed:
             rng, previous = np.random.default_rng(2), np.full((1, 10, 2), np.nan)
@@ -250,7 +250,7 @@ def test_the_shipped_network_keeps_to_its_side_of_obstacles(network: GoseloPlann
                 plan = network.plan(PlanQuery(where, goal, [occupancy], [VisitMap(occupancy)], shown))
                 changed[remember] += int(np.linalg.norm(plan[0, -1] - previous[0, -1]) > 0.3)
                 previous = plan
-    assert changed[False] > 3 and changed[True] <= changed[False] / 3
+    assert changed[False] > 10 and changed[True] <= changed[False] / 2
 
 
 def test_the_distance_from_an_old_plan_is_that_of_what_is_left_of_it() -> None:
