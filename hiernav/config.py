@@ -291,6 +291,9 @@ def load_config(path: str | Path | None = None, overrides: list[str] | None = No
         key, equals, text = override.partition("=")
         if not equals:
             raise ConfigError(f"command line: {override!r}, expected key.path=value")
+        inside = [path for path in known if path.startswith(f"{key}.")]
+        if inside:
+            raise ConfigError(f"command line: {key!r} is a section: set a key of it, such as {inside[0]!r}")
         if key not in known:
             raise ConfigError(f"command line: {unknown_key(key, known)}")
         section, _, leaf = key.rpartition(".")

@@ -228,7 +228,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     [
         ("skill.num_envs=0", ["skill.num_envs = 0", ">= 1"]),
         ("skill.num_env=3", ["'skill.num_env'", "did you mean 'skill.num_envs'"]),
-        ("skill=3", ["unknown key 'skill'"]),
+        ("skill=3", ["'skill' is a section", "such as 'skill.preset'"]),
         ("seed", ["'seed'", "key.path=value"]),
         ("=3", ["unknown key ''"]),
         ("skill.tau=[", ["skill.tau", "malformed YAML"]),
