@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from hiernav.config import TrainConfig, dump_config, load_config
+from hiernav.lock import FolderLock
 
 
 class RunError(ValueError):
@@ -45,12 +46,13 @@ class WorkersLost(RuntimeError):
 
 
 class Run:
-    """One run folder, open for training."""
+    """One run folder; only one process at a time writes to it, from its first write on until `close`."""
 
     def __init__(self, path: Path, config: TrainConfig) -> None:
         self.path, self.config = path, config
         self._writer: Any = None
         self._began: dict[str, float] = {}
+        self._lock = FolderLock(path)
 
     @classmethod
     def create(cls, config: TrainConfig, begin: Callable[[Run], None] | None = None) -> Run:
@@ -62,21 +64,23 @@ class Run:
 
         Raises:
             RunError: the folder holds a run already, or there is a `begin` and it holds anything; or it cannot be
-                written to.
+                written to, or another process is about to make a run there.
         """
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{config.robot}-{config.seed}"
-        path = Path(config.run_dir) if config.run_dir else Path("runs") / name
-        if (path / "config.yaml").exists():
-            raise RunError(f"{path} holds a run already: go on with --resume {path}, or choose another run_dir")
+        run = cls(Path(config.run_dir) if config.run_dir else Path("runs") / name, config)
+        run._require_none()
         if begin is not None:
-            if path.exists() and next(path.iterdir(), None) is not None:
-                raise RunError(f"{path} is not empty: choose another run_dir")
-            _create_begun(path, config, begin)
-            return cls(path, config)
-        path.mkdir(parents=True, exist_ok=True)
-        write_atomically(path / "config.yaml", dump_config(config).encode())
-        sync(path.parent)
-        return cls(path, config)
+            if run.path.exists() and next(run.path.iterdir(), None) is not None:
+                raise RunError(f"{run.path} is not empty: choose another run_dir")
+            _create_begun(run.path, config, begin)
+            return run
+        run.path.mkdir(parents=True, exist_ok=True)
+        run._hold()
+        run._require_none()
+        write_atomically(run.path / "config.yaml", dump_config(config).encode())
+        sync(run.path.parent)
+        run.close()
+        return run
 
     @classmethod
     def open(cls, path: str | Path) -> Run:
@@ -137,14 +141,16 @@ class Run:
         """A stage's checkpoint, or None; `rewind` cuts off logs that are newer than every stage's checkpoint.
 
         Raises:
-            RunError: the checkpoint cannot be read.
+            RunError: the checkpoint cannot be read, or the logs cannot be written to.
         """
         if rewind:
-            # every stage: the skill's metrics are newer than the planner's checkpoint and must stay
-            known = [_read_checkpoint(file) for file in self.path.glob("*/checkpoint.pt")]
-            for key, name in _LOGS.items():
-                if (log := self.path / name).exists():
-                    os.truncate(log, min(max((state.get(key, 0) for state in known), default=0), log.stat().st_size))
+            with self.writing():
+                # every stage: the skill's metrics are newer than the planner's checkpoint and must stay
+                known = [_read_checkpoint(file) for file in self.path.glob("*/checkpoint.pt")]
+                for key, name in _LOGS.items():
+                    if (log := self.path / name).exists():
+                        length = max((state.get(key, 0) for state in known), default=0)
+                        os.truncate(log, min(length, log.stat().st_size))
         file = self.path / stage / "checkpoint.pt"
         return _read_checkpoint(file) if file.exists() else None
 
@@ -157,9 +163,10 @@ class Run:
         """Whatever goes wrong inside with writing to the run folder becomes one error that says how to go on.
 
         Raises:
-            RunError: in the place of an OSError.
+            RunError: another process writes to the folder, or in the place of an OSError.
         """
         try:
+            self._hold()
             yield
         except OSError as error:
             self._writer = None  # what it still holds cannot be written either
@@ -169,10 +176,17 @@ class Run:
             ) from error
 
     def summarize(self, values: Mapping[str, Any]) -> None:
-        """Merge values into `summary.json`."""
+        """Merge values into `summary.json`.
+
+        Raises:
+            RunError: what is there cannot be read, or it cannot be written.
+        """
         file = self.path / "summary.json"
-        known = json.loads(file.read_text()) if file.exists() else {}
         with self.writing():
+            try:
+                known = _json_object(file.read_text()) if file.exists() else {}
+            except _DAMAGED as error:
+                raise _damaged(file, error) from None
             write_atomically(file, (json.dumps({**known, **values}, indent=2) + "\n").encode())
 
     def _append(self, log: str, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
@@ -189,9 +203,21 @@ class Run:
                     self._writer.add_scalar(f"{curves}/{key}", value, step)
 
     def close(self) -> None:
+        """End the curves, and let other processes write to the folder."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+        self._lock.release()
+
+    def _require_none(self) -> None:
+        if (self.path / "config.yaml").exists():
+            raise RunError(
+                f"{self.path} holds a run already: go on with --resume {self.path}, or choose another run_dir"
+            )
+
+    def _hold(self) -> None:
+        if not self._lock.acquire():
+            raise RunError(f"{self.path} is in use: another process trains in it; wait until it has ended, or stop it")
 
 
 def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None]) -> None:
@@ -214,18 +240,46 @@ def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None])
 
 
 def spent_seconds(folder: Path, stage: str) -> float:
-    """What a stage has taken in all processes that worked on it, as its run folder tells; 0 if there is none."""
+    """What a stage has taken in all processes that worked on it, as its run folder tells; 0 if there is none.
+
+    Raises:
+        RunError: `summary.json` or `rates.jsonl` is damaged.
+    """
     summary, rates = folder / "summary.json", folder / "rates.jsonl"
-    outcome = json.loads(summary.read_text()).get(stage, {}) if summary.exists() else {}
+    try:
+        outcome = _json_object(summary.read_text()).get(stage, {}) if summary.exists() else {}
+        total = float(outcome.get("seconds", 0.0))
+    except _DAMAGED as error:
+        raise _damaged(summary, error) from None
     seconds, step = 0.0, 0
-    whole, _, _ = rates.read_text().rpartition("\n") if rates.exists() else ("", "", "")  # the last may be half a line
-    for line in map(json.loads, whole.splitlines()):
-        if line["stage"] == stage:
-            # older runs tell only how fast they were
-            rate = line.get("steps_per_second")
-            seconds = line.get("seconds") or seconds + ((line["step"] - step) / rate if rate else 0.0)
-            step = line["step"]
-    return max(seconds, outcome.get("seconds", 0.0))
+    try:
+        # the last may be half a line
+        whole, _, _ = rates.read_text().rpartition("\n") if rates.exists() else ("", "", "")
+        for line in map(_json_object, whole.splitlines()):
+            if line["stage"] == stage:
+                # older runs tell only how fast they were
+                rate = line.get("steps_per_second")
+                seconds = line.get("seconds") or seconds + ((line["step"] - step) / rate if rate else 0.0)
+                step = line["step"]
+        return max(seconds, total)
+    except _DAMAGED as error:
+        raise _damaged(rates, error) from None
+
+
+_DAMAGED = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
+"""What reading a file of JSON that somebody else has written to, or a disk has lost part of, raises."""
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError(f"{type(value).__name__}, expected an object")
+    return value
+
+
+def _damaged(file: Path, error: Exception) -> RunError:
+    reason = f"no {error}" if isinstance(error, KeyError) else error
+    return RunError(f"{file} is damaged ({reason}): restore it, or remove it and go on with --resume")
 
 
 def newest_run(folder: str | Path = "runs") -> Path:

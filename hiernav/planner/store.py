@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from hiernav.lock import LOCK, FolderLock
 from hiernav.planner.dataset import LabelSettings, Samples, label_worlds, map_tasks
 
 FORMAT_VERSION = 1
@@ -74,22 +75,41 @@ def write_dataset(
         on_progress: told the number of samples that are there.
 
     Raises:
-        DatasetError: the folder holds a data set of another kind, one with more samples, or a damaged one.
+        DatasetError: the folder holds a data set of another kind, one with more samples, or a damaged one, or another
+            process writes to it.
         OSError: it cannot be written to.
     """
-    folder = Path(folder)
-    manifest = Manifest(FORMAT_VERSION, settings, seed, count, ())
-    if (folder / MANIFEST).exists():
-        made = read_manifest(folder).made
-        if count < made:
-            raise DatasetError(
-                f"{folder} has {made:,} samples already, {count:,} are wanted: choose another folder, or train on the "
-                f"first {count:,} of these with planner.samples={count}"
-            )
-        manifest = msgspec.structs.replace(_compatible(folder, read_manifest(folder), manifest), samples=count)
-    elif folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        raise DatasetError(f"{folder} is not a data set and not empty: choose another folder")
+    folder, wanted = Path(folder), Manifest(FORMAT_VERSION, settings, seed, count, ())
+    _begun(folder, wanted)  # before anything is written
     folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder)
+    if not lock.acquire():
+        raise DatasetError(f"{folder} is in use: another process writes this data set; wait until it has ended")
+    try:
+        return _make_missing(folder, _begun(folder, wanted), processes, on_progress)
+    finally:
+        lock.release()
+
+
+def _begun(folder: Path, wanted: Manifest) -> Manifest:
+    """The wanted data set with what the folder has of it."""
+    if (folder / MANIFEST).exists():
+        there = _compatible(folder, read_manifest(folder), wanted)
+        if wanted.samples < there.made:
+            raise DatasetError(
+                f"{folder} has {there.made:,} samples already, {wanted.samples:,} are wanted: choose another folder, "
+                f"or train on the first of these with planner.samples={wanted.samples}"
+            )
+        return msgspec.structs.replace(there, samples=wanted.samples)
+    if folder.is_file() or (folder.is_dir() and any(entry.name != LOCK for entry in folder.iterdir())):
+        raise DatasetError(f"{folder} is not a data set and not empty: choose another folder")
+    return wanted
+
+
+def _make_missing(
+    folder: Path, manifest: Manifest, processes: int, on_progress: Callable[[int], None] | None
+) -> Manifest:
+    settings, count = manifest.settings, manifest.samples
     worlds = -(-_SHARD_SAMPLES // settings.samples_per_world)
     size = worlds * settings.samples_per_world
     wanted = [min(size, count - first) for first in range(0, count, size)]
@@ -98,7 +118,7 @@ def write_dataset(
     while kept < min(len(wanted), len(manifest.shards)) and manifest.shards[kept].samples == wanted[kept]:
         kept += 1
     shards = list(manifest.shards[:kept])
-    tasks = [(folder, settings, seed, number, worlds, wanted[number]) for number in range(kept, len(wanted))]
+    tasks = [(folder, settings, manifest.seed, number, worlds, wanted[number]) for number in range(kept, len(wanted))]
     done = sum(shard.samples for shard in shards)
     if on_progress is not None:
         on_progress(done)

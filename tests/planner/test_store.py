@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hiernav import cli
+from hiernav.lock import FolderLock
 from hiernav.planner import store
 from hiernav.planner.dataset import LabelSettings, Samples, make_samples
 from hiernav.planner.store import DatasetError, read_dataset, read_manifest, write_dataset
@@ -84,6 +85,31 @@ def test_samples_that_are_there_are_never_thrown_away(folder: Path, count: int):
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
     assert same(read_dataset(folder, count), make_samples(SETTINGS, count, SEED))  # as the message says
     assert write_dataset(folder, SETTINGS, 20, SEED).made == 20
+
+
+def test_one_process_at_a_time_writes_to_a_data_set_and_others_read_it(folder: Path):
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    lock = FolderLock(folder)
+    assert lock.acquire()
+    with pytest.raises(DatasetError, match=r"data is in use: another process writes this data set; [^\n]*$"):
+        write_dataset(folder, SETTINGS, 30, SEED)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    assert len(read_dataset(folder)) == 20
+    lock.release()
+    seen: list[bool] = []
+    write_dataset(folder, SETTINGS, 30, SEED, on_progress=lambda _: seen.append(FolderLock(folder).acquire()))
+    assert len(seen) == 3 and not any(seen)
+    assert FolderLock(folder).acquire()
+
+
+def test_a_data_set_that_was_stopped_at_its_first_shard_is_begun_again(tmp_path: Path, monkeypatch):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(store, "_make_shard", interrupted)
+        write_dataset(tmp_path / "data", SETTINGS, 8, SEED)
+    assert write_dataset(tmp_path / "data", SETTINGS, 8, SEED).finished
 
 
 def test_samples_of_another_kind_are_not_mixed_in(folder: Path):
