@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 try:
     import fcntl
@@ -14,36 +15,49 @@ LOCK = ".lock"
 """Empty file that stays in the folder; the lock is on it and ends with the process, however that ends."""
 
 
+class _Held:
+    def __init__(self, file: int) -> None:
+        self.file = file
+
+    def __del__(self) -> None:
+        os.close(self.file)
+
+
+_held: WeakValueDictionary[Path, _Held] = WeakValueDictionary()
+"""Locks that this process has: whoever works on a folder here may do so twice."""
+
+
 class FolderLock:
-    """Held from `acquire` to `release`, or as long as this object lives."""
+    """A process's lock on a folder, from `acquire` to `release`, or as long as this object lives."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._file: int | None = None
+        self._held: _Held | None = None
 
     def acquire(self) -> bool:
-        """Whether the lock is held now; False if another holds it.
+        """Whether this process has the lock now; False if another one has it.
 
         Raises:
             OSError: the folder cannot be written to.
         """
-        if self._file is not None or fcntl is None:
-            return True
-        file = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)  # not inherited by programs started here
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(file)
-            return False
-        except OSError:  # a file system without locks
-            pass
-        self._file = file
+        if self._held is None and fcntl is not None:
+            folder = self.folder.resolve()
+            self._held = _held.get(folder) or _lock(folder / LOCK)
+            if self._held is None:
+                return False
+            _held[folder] = self._held
         return True
 
     def release(self) -> None:
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+        self._held = None
 
-    def __del__(self) -> None:
-        self.release()
+
+def _lock(file: Path) -> _Held | None:
+    held = _Held(os.open(file, os.O_RDWR | os.O_CREAT, 0o666))  # not inherited by programs started here
+    try:
+        fcntl.flock(held.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return None
+    except OSError:  # a file system without locks
+        pass
+    return held

@@ -6,6 +6,7 @@
     tensorboard/      both as curves
     planner/, skill/  checkpoints of the two stages
     summary.json      outcome
+    .lock             empty; locked by the process that writes to the folder
 
 A checkpoint knows how long both logs were when it was written; resuming cuts off what came later, so that a resumed
 run leaves the same files as an uninterrupted one. Checkpoints, and what they speak of, outlive a power failure.

@@ -5,17 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import tiny_run
+from locked import other_process
 
 from hiernav import lock as lock_module
 from hiernav import run as run_module
 from hiernav.config import ConfigError, load_config
-from hiernav.lock import FolderLock
 from hiernav.run import Run, RunError, newest_run, spent_seconds, write_atomically
 
 
@@ -102,16 +100,15 @@ def test_seconds_of_a_stage_are_those_of_all_processes_that_worked_on_it(run, mo
     now[0] += 40.0
     run.log_rates("skill", 200, {"steps_per_second": 10.0})
     now[0] += 3.0  # lost: the process is stopped
-    run.close()
     again = Run.open(run.path)
     now[0] += 1000.0
     again.start_clock("skill")
     now[0] += 2.0
     again.log_rates("skill", 220, {"steps_per_second": 10.0})
-    again.close()
     assert spent_seconds(run.path, "skill") == 42.0 and spent_seconds(run.path, "planner") == 0.0
     run.summarize({"skill": {"seconds": 50.0}})
     assert spent_seconds(run.path, "skill") == 50.0, "the evaluation at the end is in the summary alone"
+    again.close()
 
 
 @pytest.mark.parametrize(
@@ -145,58 +142,46 @@ def test_a_damaged_log_is_named_and_what_to_do(run, name, text):
     assert (run.path / name).read_text() == text
 
 
-TRAINS = """
-import sys
-from hiernav.run import Run
-run = Run.open(sys.argv[1])
-run.load("skill", rewind=True)
-print("in it", flush=True)
-sys.stdin.read()
-"""
-
-
 def test_one_process_at_a_time_writes_to_a_run_and_others_read_it(run):
     log = run.path / "metrics.jsonl"
-    with subprocess.Popen(
-        [sys.executable, "-c", TRAINS, str(run.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdout.readline() == b"in it\n"
-        log.write_text("what the other one wrote\n")
-        second = Run.open(run.path)
+    log.write_text("what the other one wrote\n")
+    with other_process(run.path) as got:
+        assert got
         for write in (
-            lambda: second.load("skill", rewind=True),
-            lambda: second.log("skill", 1, {"reach_rate": 0.5}),
-            lambda: second.log_rates("skill", 1, {"steps_per_second": 1.0}),
-            lambda: second.summarize({"skill": {}}),
-            lambda: second.writing().__enter__(),
+            lambda: run.load("skill", rewind=True),
+            lambda: run.log("skill", 1, {"reach_rate": 0.5}),
+            lambda: run.log_rates("skill", 1, {"steps_per_second": 1.0}),
+            lambda: run.summarize({"skill": {}}),
+            lambda: run.writing().__enter__(),
         ):
             with pytest.raises(RunError, match=r"run is in use: another process trains in it; [^\n]*$"):
                 write()
         assert log.read_text() == "what the other one wrote\n"
-        assert second.load("skill") is None and spent_seconds(second.path, "skill") == 0.0  # read
-        other.kill()
-        other.wait()
-    second.summarize({"skill": {"reach_rate": 0.5}})  # whom the system has ended holds nothing
-    with pytest.raises(RunError, match="in use"):
-        run.summarize({"skill": {}})
-    second.close()
-    run.summarize({"skill": {}})
+        assert run.load("skill") is None and spent_seconds(run.path, "skill") == 0.0  # read
+    run.summarize({"skill": {"reach_rate": 0.5}})  # whoever was killed holds nothing
+    with other_process(run.path) as got:
+        assert not got
+    again = Run.open(run.path)  # in the same process
+    again.summarize({"skill": {}})
+    run.close()
+    with other_process(run.path) as got:
+        assert not got
+    again.close()
+    with other_process(run.path) as got:
+        assert got
 
 
 def test_a_run_that_is_about_to_be_made_is_not_made_twice(tmp_path):
-    lock = FolderLock(tmp_path)
-    assert lock.acquire() and lock.acquire()
-    with pytest.raises(RunError, match="in use"):
+    with other_process(tmp_path), pytest.raises(RunError, match="in use"):
         Run.create(tiny_run.config(tmp_path))
-    lock.release()
-    Run.create(tiny_run.config(tmp_path))
-    assert FolderLock(tmp_path).acquire(), "whoever made it does not train yet"
+    made = Run.create(tiny_run.config(tmp_path))
+    with other_process(made.path) as got:
+        assert got, "whoever made it does not train yet"
 
 
 def test_where_there_are_no_locks_training_goes_on_without(run, monkeypatch):
-    held = FolderLock(run.path)
-    assert held.acquire()
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, other_process(run.path) as got:
+        assert got
         patch.setattr(lock_module, "fcntl", None)
         run.summarize({"skill": {}})
 

@@ -2,6 +2,7 @@
 
     dataset.json     format version, label settings, seed, number of samples; name, samples and SHA-256 of every shard
     shard-00000.npz  `image` (S, C, 64, 64) uint8, `distance` (S,) float32, `label` (S, K, 2) float32, as `Samples`
+    .lock            empty; locked by the process that writes to the folder
 
 Shard k holds the samples from k * (samples per shard) on of the seed's endless sequence, the one that `make_samples`
 draws from: a data set can be made larger, and training on it is training on samples made for the run.

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from locked import other_process
 
 from hiernav import cli
-from hiernav.lock import FolderLock
 from hiernav.planner import store
 from hiernav.planner.dataset import LabelSettings, Samples, make_samples
 from hiernav.planner.store import DatasetError, read_dataset, read_manifest, write_dataset
@@ -89,17 +89,22 @@ def test_samples_that_are_there_are_never_thrown_away(folder: Path, count: int):
 
 def test_one_process_at_a_time_writes_to_a_data_set_and_others_read_it(folder: Path):
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
-    lock = FolderLock(folder)
-    assert lock.acquire()
-    with pytest.raises(DatasetError, match=r"data is in use: another process writes this data set; [^\n]*$"):
-        write_dataset(folder, SETTINGS, 30, SEED)
-    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
-    assert len(read_dataset(folder)) == 20
-    lock.release()
+    with other_process(folder) as got:
+        assert got
+        with pytest.raises(DatasetError, match=r"data is in use: another process writes this data set; [^\n]*$"):
+            write_dataset(folder, SETTINGS, 30, SEED)
+        assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+        assert len(read_dataset(folder)) == 20
     seen: list[bool] = []
-    write_dataset(folder, SETTINGS, 30, SEED, on_progress=lambda _: seen.append(FolderLock(folder).acquire()))
-    assert len(seen) == 3 and not any(seen)
-    assert FolderLock(folder).acquire()
+
+    def look(_: int) -> None:
+        with other_process(folder) as got:
+            seen.append(got)
+
+    write_dataset(folder, SETTINGS, 30, SEED, on_progress=look)
+    assert seen == [False, False, False]
+    with other_process(folder) as got:
+        assert got
 
 
 def test_a_data_set_that_was_stopped_at_its_first_shard_is_begun_again(tmp_path: Path, monkeypatch):
