@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
 
 import torch
 
 from hiernav.decode import ConfigError
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
+
+Result = TypeVar("Result")
 
 
 def choose_device(name: str, key: str) -> torch.device:
@@ -39,6 +42,36 @@ def choose_precision(name: str, device: torch.device) -> torch.dtype:
         native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
         name = "bfloat16" if device.type == "cpu" and native else "float32"
     return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
+
+
+class Recorded(Generic[Result]):
+    """A function of one tensor that works in place on a device; on a GPU its kernels are recorded and played back.
+
+    At the sizes of a skill it takes longer to start the kernels of an update one by one than to run them. The first
+    calls are made as they are: they load the kernels and set their memory aside. From the next one on all arguments
+    must be of one shape, nothing outside of tensors changes any more, and a result is valid until the next call.
+    """
+
+    _CALLS_BEFORE = 3
+
+    def __init__(self, function: Callable[[torch.Tensor], Result], device: torch.device) -> None:
+        self._function, self._on_gpu = function, device.type == "cuda"
+        self._calls = 0
+        self._recording: tuple[torch.cuda.CUDAGraph, torch.Tensor, Result] | None = None
+
+    def __call__(self, argument: torch.Tensor) -> Result:
+        if not self._on_gpu or self._calls < self._CALLS_BEFORE:
+            self._calls += 1
+            return self._function(argument)
+        if self._recording is None:
+            graph, place = torch.cuda.CUDAGraph(), argument.clone()
+            with torch.cuda.graph(graph):
+                result = self._function(place)
+            self._recording = graph, place, result
+        graph, place, result = self._recording
+        place.copy_(argument)
+        graph.replay()
+        return result
 
 
 def keep_freed_memory() -> None:

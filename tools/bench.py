@@ -40,6 +40,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=4.0, help="spent on each figure (4)")
     parser.add_argument("--threads", type=int, default=1, help="for physics and torch (1)")
     parser.add_argument("--hidden", type=int, default=256, help="width of both hidden layers, for --update and --peers")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the updates, for --peers (cpu)")
     parser.add_argument("--peer-python", default=sys.executable, metavar="PATH", help="that the peers are installed in")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="for --tick and --plan")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")

@@ -53,7 +53,7 @@ def bench_peers(arguments: argparse.Namespace) -> dict[str, Any]:
     from sac_peers import LEARNERS, PEERS
 
     print("peers: starting", end="", flush=True)
-    options = ["--threads", str(arguments.threads), "--hidden", str(arguments.hidden)]
+    options = ["--threads", str(arguments.threads), "--hidden", str(arguments.hidden), "--device", arguments.device]
     workers, skipped = {}, {}
     for name in LEARNERS:
         print(f" {name}", end="", flush=True)

@@ -16,11 +16,13 @@ from hiernav.skill.networks import Actor, Critic
 class PlainSac:
     """Twin critics as two modules, one Adam, no tensordict inside the update."""
 
-    def __init__(self, layout: ObservationLayout, actions: int, hidden: tuple[int, ...] = (256, 256)) -> None:
-        self.actor = Actor(layout, actions, hidden, layer_norm=False)
-        self.critics = [Critic(layout, actions, hidden, layer_norm=False) for _ in range(2)]
+    def __init__(
+        self, layout: ObservationLayout, actions: int, hidden: tuple[int, ...] = (256, 256), device: str = "cpu"
+    ) -> None:
+        self.actor = Actor(layout, actions, hidden, layer_norm=False).to(device)
+        self.critics = [Critic(layout, actions, hidden, layer_norm=False).to(device) for _ in range(2)]
         self.targets = copy.deepcopy(self.critics)
-        self.log_alpha = torch.zeros((), requires_grad=True)
+        self.log_alpha = torch.zeros((), requires_grad=True, device=device)
         self.target_entropy = -float(actions)
         critics = [p for critic in self.critics for p in critic.parameters()]
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *critics, self.log_alpha], lr=3e-4, fused=True)

@@ -1,6 +1,6 @@
 """SAC learners that `tools/bench.py --peers` races, each in a process and, if need be, a Python of its own.
 
-    python tools/sac_peers.py NAME [--threads 1] [--hidden 256]
+    python tools/sac_peers.py NAME [--threads 1] [--hidden 256] [--device cpu]
 
 prints "ready", or "skip" and a reason; from then on it answers each line it reads, a number of seconds, with the
 updates done in that time and the seconds it took. An update is a batch of 256 drawn from a replay buffer and one
@@ -37,39 +37,43 @@ BURST = 16
 Burst = Callable[[], object]
 
 
-def hiernav(hidden: int, precision: str = "auto") -> Burst:
+def hiernav(hidden: int, device: str, precision: str = "auto") -> Burst:
     """`Learner` and `Replay`, as `hiernav train` uses them."""
+    import torch
     from tensordict import TensorDict
 
+    from hiernav.device import Recorded
     from hiernav.nav.observation import observation_layout
     from hiernav.skill.replay import Replay
     from hiernav.skill.sac import Learner, SacSettings
 
     settings = SacSettings(hidden=(hidden, hidden), precision=precision)
-    learner = Learner(observation_layout("doggo"), ACTIONS, settings)
+    learner = Learner(observation_layout("doggo"), ACTIONS, settings, device)
     folder = tempfile.mkdtemp(prefix="hiernav-bench-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    replay = Replay(Path(folder) / "replay", STORED, OBSERVATION, ACTIONS, BATCH)
+    replay = Replay(Path(folder) / "replay", STORED, OBSERVATION, ACTIONS, BATCH, device)
     replay.extend(TensorDict(torch_transitions(), [STORED]))
-    return lambda: [learner.update(replay.sample()) for _ in range(BURST)]
+    learn = Recorded(lambda rows: learner.update(replay.batch(rows)), torch.device(device))
+    return lambda: [learn(rows) for rows in replay.draw(BURST)]
 
 
-def hiernav_float32(hidden: int) -> Burst:
+def hiernav_float32(hidden: int, device: str) -> Burst:
     """The same with all products in float32."""
-    return hiernav(hidden, "float32")
+    return hiernav(hidden, device, "float32")
 
 
-def plain(hidden: int) -> Burst:
+def plain(hidden: int, device: str) -> Burst:
     """SAC written by hand in plain torch, with autograd."""
     import torch
     from plain_sac import PlainSac
 
     from hiernav.nav.observation import observation_layout
 
-    learner, stored = PlainSac(observation_layout("doggo"), ACTIONS, (hidden, hidden)), torch_transitions()
+    learner = PlainSac(observation_layout("doggo"), ACTIONS, (hidden, hidden), device)
+    stored = torch_transitions(device=device)
 
     def sample() -> dict[str, Any]:
-        rows = torch.randint(STORED, (BATCH,))
+        rows = torch.randint(STORED, (BATCH,), device=device)
         return {k: v[rows] for k, v in stored.items() if k != "next"} | {
             "next": {k: v[rows] for k, v in stored["next"].items()}
         }
@@ -77,7 +81,7 @@ def plain(hidden: int) -> Burst:
     return lambda: [learner.update(sample()) for _ in range(BURST)]
 
 
-def torchrl(hidden: int) -> Burst:
+def torchrl(hidden: int, device: str) -> Burst:
     """SACLoss, its optimiser and its target updater in a loop, eager."""
     import torch
     from tensordict import TensorDict
@@ -93,15 +97,15 @@ def torchrl(hidden: int) -> Burst:
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
-        spec=Bounded(-1.0, 1.0, (ACTIONS,)),
-    )
-    critic = ValueOperator(MLP(OBSERVATION + ACTIONS, 1, **shape), in_keys=["observation", "action"])
+        spec=Bounded(-1.0, 1.0, (ACTIONS,), device=device),
+    ).to(device)
+    critic = ValueOperator(MLP(OBSERVATION + ACTIONS, 1, **shape).to(device), in_keys=["observation", "action"])
     loss = SACLoss(actor, critic, num_qvalue_nets=2, loss_function="l2", target_entropy=-float(ACTIONS))
     loss.make_value_estimator(gamma=0.99)
     updater = SoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
-    replay = ReplayBuffer(storage=LazyTensorStorage(STORED), batch_size=BATCH)
-    replay.extend(TensorDict(torch_transitions(), [STORED]))
+    replay = ReplayBuffer(storage=LazyTensorStorage(STORED, device=device), batch_size=BATCH)
+    replay.extend(TensorDict(torch_transitions(device=device), [STORED]))
 
     def update() -> None:
         out = loss(replay.sample())
@@ -113,18 +117,19 @@ def torchrl(hidden: int) -> Burst:
     return lambda: [update() for _ in range(BURST)]
 
 
-def sb3(hidden: int) -> Burst:
+def sb3(hidden: int, device: str) -> Burst:
     """Stable-Baselines3's SAC."""
     from stable_baselines3 import SAC
 
-    return _baselines(SAC, hidden)
+    return _baselines(SAC, hidden, device)
 
 
-def sbx(hidden: int) -> Burst:
-    """SBX's SAC: Stable-Baselines in JAX, compiled."""
+def sbx(hidden: int, device: str) -> Burst:
+    """SBX's SAC: Stable-Baselines in JAX, compiled; the device is JAX's own choice."""
+    os.environ["JAX_PLATFORMS"] = device
     from sbx import SAC
 
-    return _baselines(SAC, hidden)
+    return _baselines(SAC, hidden, device)
 
 
 LEARNERS = {f.__name__: f for f in (hiernav, hiernav_float32, plain, torchrl, sb3, sbx)}
@@ -143,17 +148,17 @@ def transitions(count: int = STORED) -> dict[str, np.ndarray]:
     return {name: values.astype(np.float32) for name, values in draws.items()}
 
 
-def torch_transitions(count: int = STORED) -> dict[str, Any]:
+def torch_transitions(count: int = STORED, device: str = "cpu") -> dict[str, Any]:
     """Random transitions as torchrl names them."""
     import torch
 
-    drawn = {name: torch.from_numpy(values) for name, values in transitions(count).items()}
+    drawn = {name: torch.from_numpy(values).to(device) for name, values in transitions(count).items()}
     following = {"observation": drawn.pop("following"), "reward": drawn.pop("reward")}
-    flags = {name: torch.zeros((count, 1), dtype=torch.bool) for name in ("done", "terminated")}
+    flags = {name: torch.zeros((count, 1), dtype=torch.bool, device=device) for name in ("done", "terminated")}
     return {**drawn, "next": {**following, **flags}}
 
 
-def _baselines(algorithm: Any, hidden: int) -> Burst:
+def _baselines(algorithm: Any, hidden: int, device: str) -> Burst:
     """A learner with the interface of Stable-Baselines3, its replay buffer filled."""
     import gymnasium
     from stable_baselines3.common.logger import configure
@@ -167,7 +172,7 @@ def _baselines(algorithm: Any, hidden: int) -> Burst:
         Spaces(),
         batch_size=BATCH,
         buffer_size=STORED,
-        device="cpu",
+        device=device,
         policy_kwargs={"net_arch": [hidden] * 2},
     )
     model.set_logger(configure(None, []))
@@ -184,6 +189,7 @@ def main() -> None:
     parser.add_argument("name", choices=LEARNERS)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--hidden", type=int, default=256, help="width of both hidden layers (256)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the updates (cpu)")
     arguments = parser.parse_args()
     # not every library asks how many threads it may start, but all of them stay on the cores they are given
     if hasattr(os, "sched_setaffinity"):
@@ -193,16 +199,18 @@ def main() -> None:
             import torch
 
             torch.set_num_threads(arguments.threads)
-        burst = LEARNERS[arguments.name](arguments.hidden)
+        burst = LEARNERS[arguments.name](arguments.hidden, arguments.device)
         burst()
     except ImportError as error:
         print(f"skip {error}", flush=True)
         return
+    wait = torch.cuda.synchronize if arguments.device == "cuda" and arguments.name != "sbx" else lambda: None
     print("ready", flush=True)
     for line in sys.stdin:
         count, began = 0, time.perf_counter()
         while (spent := time.perf_counter() - began) < float(line):
             burst()
+            wait()
             count += BURST
         print(count, spent, flush=True)
 

@@ -129,6 +129,8 @@ def torchrl_learner(config: Any) -> Any:
     skill, layout, actions = config.skill, skill_layout(config), get_robot(config.robot).action_dim
 
     class TorchrlLearner(Learner):
+        updates = 0
+
         def __init__(self) -> None:
             self.settings, self.device = skill, torch.device("cpu")
             self.actor = self._learning = Actor(layout, actions, skill.hidden, layer_norm=False)
@@ -148,7 +150,6 @@ def torchrl_learner(config: Any) -> Any:
             self._targets = SoftUpdate(self.loss, tau=skill.tau)
             self._plain_adam = torch.optim.Adam(self.loss.parameters(), lr=skill.learning_rate)
             self._weights = list(self.actor.parameters())
-            self.updates = 0
 
         def update(self, batch: Any) -> dict[str, torch.Tensor]:
             out = self.loss(batch)

@@ -30,6 +30,8 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """That the process may use."""
     system: str
     versions: dict[str, str]
+    gpu: str | None = None
+    """That updates are computed on unless the settings say otherwise."""
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -218,7 +220,8 @@ def this_machine() -> Machine:
             versions[name] = version(name)
         except PackageNotFoundError:
             pass
-    return Machine(cpu=_cpu(), cores=_cores(), system=f"{platform.system()} {platform.machine()}", versions=versions)
+    system = f"{platform.system()} {platform.machine()}"
+    return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions, gpu=_gpu())
 
 
 def git_state(root: Path, results: Path) -> tuple[str | None, bool | None]:
@@ -249,6 +252,15 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or "unknown"
+
+
+def _gpu() -> str | None:
+    for file in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):
+        for line in file.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == "Model":
+                return value.strip()
+    return None
 
 
 def _cores() -> int:

@@ -25,11 +25,28 @@ class Replay:
     buffer_size`.)
 
     Raises OSError if the disk has no room for `size` transitions.
+
+    Args:
+        folder: of the files.
+        size: transitions that it holds.
+        observation: length of one.
+        action: length of one.
+        batch_size: transitions of a batch.
+        device: that batches are drawn on; a GPU keeps a copy of all transitions.
     """
 
-    def __init__(self, folder: Path, size: int, observation: int, action: int, batch_size: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        size: int,
+        observation: int,
+        action: int,
+        batch_size: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self._folder = folder
         folder.mkdir(parents=True, exist_ok=True)
+        self._device = torch.device(device)
         self.fresh = not (folder / "meta.json").exists()
         """Whether its files were made just now, so that nothing is in them whatever a checkpoint says."""
         if not self.fresh:
@@ -53,6 +70,9 @@ class Replay:
         self._buffer = ReplayBuffer(storage=self._storage)
         self._batch_size = batch_size
         self._columns = {key: self._data[key].as_subclass(torch.Tensor) for key in KEYS}
+        self._drawn_from = self._columns
+        if self._device.type != "cpu":
+            self._drawn_from = {key: torch.empty_like(c, device=self._device) for key, c in self._columns.items()}
         self._set(0, 0)
 
     def __len__(self) -> int:
@@ -60,15 +80,22 @@ class Replay:
 
     def extend(self, transitions: TensorDict) -> None:
         """Append transitions (M,)."""
-        self._buffer.extend(transitions.select(*KEYS))
+        places = self._buffer.extend(transitions.select(*KEYS))
+        if self._drawn_from is not self._columns:
+            places = places.to(self._device)
+            for key, column in self._drawn_from.items():
+                column[places] = transitions[key].to(self._device)
 
-    def sample(self) -> TensorDict:
-        """A random batch (B,).
+    def draw(self, batches: int) -> torch.Tensor:
+        """Rows (batches, B) of random transitions, on the device."""
+        return torch.randint(len(self), (batches, self._batch_size)).to(self._device)
 
-        Drawn here from the columns: the buffer's own way takes four times as long, and it would be run at every update.
+    def batch(self, rows: torch.Tensor) -> TensorDict:
+        """The transitions (B,) in those rows (B,), on the device.
+
+        Taken here from the columns: the buffer's own way takes four times as long, and it would be run at every update.
         """
-        rows = torch.randint(len(self), (self._batch_size,))
-        drawn = {key: column.index_select(0, rows) for key, column in self._columns.items()}
+        drawn = {key: column.index_select(0, rows) for key, column in self._drawn_from.items()}
         following = {key[1]: drawn.pop(key) for key in KEYS if isinstance(key, tuple)}
         return TensorDict({**drawn, "next": TensorDict(following, [len(rows)])}, [len(rows)])
 
@@ -91,6 +118,9 @@ class Replay:
         # the files are the storage: only how much of them is valid has to be told
         self._storage._len = length
         self._buffer.writer.load_state_dict({"_cursor": cursor, "_write_count": length})
+        if self._drawn_from is not self._columns:
+            for key, column in self._drawn_from.items():
+                column[:length] = self._columns[key][:length].to(self._device)
 
 
 def _reserve(folder: Path) -> None:
@@ -110,14 +140,25 @@ def _reserve(folder: Path) -> None:
         raise
 
 
-def mirror_half(batch: TensorDict, mirror: Mirror) -> None:
-    """Reflect the first half of a batch (B,) of transitions left to right, in place."""
-    half = len(batch) // 2
-    observation = torch.from_numpy(mirror.observation_index), torch.from_numpy(mirror.observation_sign)
-    action = torch.from_numpy(mirror.action_index), torch.from_numpy(mirror.action_sign)
-    for values, (order, sign) in (
-        (batch["observation"], observation),
-        (batch["next", "observation"], observation),
-        (batch["action"], action),
-    ):
-        values[:half] = values[:half].index_select(1, order).mul_(sign)
+class HalfMirror:
+    """Reflects the first half of a batch (B,) of transitions left to right, in place.
+
+    Args:
+        mirror: of the robot's observations and actions.
+        device: of the batches.
+    """
+
+    def __init__(self, mirror: Mirror, device: torch.device | str = "cpu") -> None:
+        sides = (mirror.observation_index, mirror.observation_sign), (mirror.action_index, mirror.action_sign)
+        self._observation, self._action = (
+            (torch.from_numpy(order).to(device), torch.from_numpy(sign).to(device)) for order, sign in sides
+        )
+
+    def __call__(self, batch: TensorDict) -> None:
+        half = len(batch) // 2
+        for values, (order, sign) in (
+            (batch["observation"], self._observation),
+            (batch["next", "observation"], self._observation),
+            (batch["action"], self._action),
+        ):
+            values[:half] = values[:half].index_select(1, order).mul_(sign)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict
 from tensordict.nn import InteractionType, TensorDictModule
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.optim.adam import adam
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
@@ -92,24 +93,27 @@ class Learner:
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
         self._optimizer = _Adam(self.loss.weights, settings.learning_rate)
-        self._actor_weights = list(self._learning.parameters())
-        self._mean_weights = list(self._averaging.parameters())
-        self.updates = 0
+        # of the averaged actor, in one piece and in the order in which the loss has the actor's
+        self._mean = parameters_to_vector(self._averaging.parameters()).detach().clone()
+        self._last = self.loss.weights.detach()[: len(self._mean)]
+        if self._averaging is not self._learning:
+            vector_to_parameters(self._mean, self._averaging.parameters())
 
     def update(self, batch: TensorDict) -> dict[str, torch.Tensor]:
-        """One gradient step on a batch (B,) of transitions; returns detached scalars on the learner's device."""
-        if self.device.type != "cpu":
-            batch = batch.to(self.device)
+        """One gradient step on a batch (B,) of transitions; returns detached scalars, both on the learner's device."""
         metrics = self.loss.differentiate(batch)
         self._optimizer.step()
         self.loss.move_targets(self.settings.tau)
-        self.updates += 1
         if self._averaging is not self._learning:
             # the mean of all actors at first, so that the untrained one leaves no trace
-            weight = 1.0 / min(self.updates, self.settings.actor_average)
-            with torch.no_grad():
-                torch._foreach_lerp_(self._mean_weights, self._actor_weights, weight)
+            share = self._optimizer.state["step"].clamp(max=self.settings.actor_average).reciprocal()
+            self._mean.lerp_(self._last, share)
         return metrics
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps so far."""
+        return int(self._optimizer.state["step"])
 
     @property
     def finite(self) -> bool:
@@ -140,7 +144,6 @@ class Learner:
         self._averaging.load_state_dict(state["average"])
         for name, value in self._optimizer.state.items():
             value.copy_(state["optimizer"][name])
-        self.updates = state["updates"]
         self.publish()
 
 

@@ -20,7 +20,7 @@ import torch
 from tensordict import TensorDict
 
 from hiernav.config import SkillConfig, TrainConfig
-from hiernav.device import choose_device, random_state, restore_random_state
+from hiernav.device import Recorded, choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.nav.planners import COUNTS, VerifiedPlanner
@@ -34,7 +34,7 @@ from hiernav.sim.worlds import sample_layout
 from hiernav.skill.collect import make_batches, segment_frames
 from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.networks import Actor
-from hiernav.skill.replay import Replay, mirror_half
+from hiernav.skill.replay import HalfMirror, Replay
 from hiernav.skill.sac import Learner, SacSettings
 
 _WINDOW = 200
@@ -163,8 +163,10 @@ class SkillTrainer:
                 layout.size,
                 self._robot.action_dim,
                 skill.batch_size,
+                self.learner.device,
             )
-        self._mirror = mirror_of(config.robot, layout) if skill.mirror else None
+        self._mirror = HalfMirror(mirror_of(config.robot, layout), self.learner.device) if skill.mirror else None
+        self._learn = Recorded(self._learn_from, self.learner.device)
         self.steps = 0
         self.evaluations: list[dict[str, float]] = []
         self.best_actor: dict[str, torch.Tensor] | None = None
@@ -267,9 +269,10 @@ class SkillTrainer:
         self._due += frames * skill.updates_per_step
         self.learner.set_alpha_floor(alpha_floor(skill, self.steps))
         metrics: dict[str, torch.Tensor] = {}
-        while self._due >= 1.0:
-            metrics = self.learner.update(self._batch())
-            self._due -= 1.0
+        batches = int(self._due)
+        for rows in self.replay.draw(batches):
+            metrics = self._learn(rows)
+        self._due -= batches
         self.learner.publish()
         values = {key: float(value) for key, value in metrics.items()}
         broken = [key for key, value in values.items() if not np.isfinite(value)]
@@ -289,11 +292,12 @@ class SkillTrainer:
             f"it, with another seed in {path / 'config.yaml'} other worlds follow"
         )
 
-    def _batch(self) -> TensorDict:
-        batch = self.replay.sample()
+    def _learn_from(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+        """One update on the transitions in those rows (B,) of the replay buffer, half of them reflected on request."""
+        batch = self.replay.batch(rows)
         if self._mirror is not None:
-            mirror_half(batch, self._mirror)
-        return batch
+            self._mirror(batch)
+        return self.learner.update(batch)
 
     def _statistics(self, data: TensorDict) -> dict[str, float]:
         terms = data["next", "terms"].mean(0).tolist()
