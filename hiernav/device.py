@@ -47,9 +47,9 @@ def choose_precision(name: str, device: torch.device) -> torch.dtype:
 class Recorded(Generic[Result]):
     """A function of one tensor that works in place on a device; on a GPU its kernels are recorded and played back.
 
-    At the sizes of a skill it takes longer to start the kernels of an update one by one than to run them. The first
-    calls are made as they are: they load the kernels and set their memory aside. From the next one on all arguments
-    must be of one shape, nothing outside of tensors changes any more, and a result is valid until the next call.
+    Played back, a hundred small kernels need not be started one by one. The first calls are made as they are: they load
+    the kernels and set their memory aside. From the next one on all arguments must be of one shape, nothing outside of
+    tensors changes any more, and a result is valid until the next call.
     """
 
     _CALLS_BEFORE = 3
