@@ -93,6 +93,8 @@ class Learner:
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.discount)
         self._optimizer = _Adam(self.loss.weights, settings.learning_rate)
+        # on the device, where recorded updates count it; Adam's own, in float32, ends at 16,777,216
+        self._updates = torch.zeros((), dtype=torch.int64, device=self.device)
         # of the averaged actor, in one piece and in the order in which the loss has the actor's
         self._mean = parameters_to_vector(self._averaging.parameters()).detach().clone()
         self._last = self.loss.weights.detach()[: len(self._mean)]
@@ -104,16 +106,17 @@ class Learner:
         metrics = self.loss.differentiate(batch)
         self._optimizer.step()
         self.loss.move_targets(self.settings.tau)
+        self._updates += 1
         if self._averaging is not self._learning:
             # the mean of all actors at first, so that the untrained one leaves no trace
-            share = self._optimizer.state["step"].clamp(max=self.settings.actor_average).reciprocal()
+            share = self._updates.clamp(max=self.settings.actor_average).reciprocal()
             self._mean.lerp_(self._last, share)
         return metrics
 
     @property
     def updates(self) -> int:
         """Gradient steps so far."""
-        return int(self._optimizer.state["step"])
+        return int(self._updates)
 
     @property
     def finite(self) -> bool:
@@ -144,6 +147,7 @@ class Learner:
         self._averaging.load_state_dict(state["average"])
         for name, value in self._optimizer.state.items():
             value.copy_(state["optimizer"][name])
+        self._updates.fill_(state["updates"])
         self.publish()
 
 

@@ -97,6 +97,13 @@ def test_an_update_changes_actor_critics_targets_and_temperature(layer_norm: boo
     assert not any(value.requires_grad for value in metrics.values())
 
 
+def test_updates_are_counted_on_past_what_single_precision_holds() -> None:
+    source = learner()
+    source.load_state_dict(source.state_dict() | {"updates": 2**24})
+    source.update(batch())
+    assert source.updates == 2**24 + 1
+
+
 def test_the_twin_critics_start_different_and_the_targets_equal_to_them() -> None:
     source = learner()
     online = source.loss.qvalue_network_params.flatten_keys(".")
