@@ -6,10 +6,12 @@ import json
 import logging
 import math
 import os
+import select
 import socket
 import stat
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,9 @@ from hiernav.runtime.driver import Driver
 LONGEST = 256
 """Bytes of a command."""
 PATIENCE = 1.0
-"""Time a client may take for its line [s]."""
+"""Time a client may take for its line, all of it [s]."""
+CLIENTS = 32
+"""Clients that may be at their line at the same time; the one after them takes the place of the first."""
 COMMANDS = ("goal X,Y", "cancel", "pause", "resume", "stop", "acknowledge", "status", "quit")
 
 log = logging.getLogger(__name__)
@@ -84,7 +88,10 @@ def describe(driver: Driver) -> dict[str, Any]:
 
 
 class ControlServer:
-    """Listens in a thread of its own, for as long as it is entered (`with`)."""
+    """Listens in a thread of its own, for as long as it is entered (`with`).
+
+    A line is obeyed as soon as it is whole: no client waits for another one, however slow that is.
+    """
 
     def __init__(self, driver: Driver, path: Path) -> None:
         """
@@ -104,7 +111,7 @@ class ControlServer:
                 raise ValueError(f"control socket {path}: there is something else")
             if _answers(path):
                 raise ValueError(f"control socket {path}: another loop listens there")
-            path.unlink()
+            path.unlink(missing_ok=True)
         self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         before = os.umask(0o177)
         try:
@@ -113,7 +120,9 @@ class ControlServer:
             raise ValueError(f"control socket {path}: {error}") from None
         finally:
             os.umask(before)
-        self._server.listen(4)
+        self._server.listen(CLIENTS)
+        self._server.setblocking(False)
+        self._closed = False
         self._thread = threading.Thread(target=self._listen, name="control", daemon=True)
 
     def __enter__(self) -> ControlServer:
@@ -121,35 +130,70 @@ class ControlServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown(socket.SHUT_RDWR)
+        self._closed = True
+        self._server.shutdown(socket.SHUT_RDWR)  # wakes the thread
+        self._thread.join(2.0)
         self._server.close()
         self.path.unlink(missing_ok=True)
-        self._thread.join(2.0)
 
     def _listen(self) -> None:
-        while True:
-            try:
-                client, _ = self._server.accept()
-            except OSError:
-                return
-            with client:
-                client.settimeout(PATIENCE)
+        clients: list[_Client] = []  # the first to have come is the first to run out of time
+        while not self._closed:
+            wait = max(clients[0].deadline - time.monotonic(), 0.0) if clients else None
+            ready = select.select([self._server, *clients], [], [], wait)[0]
+            for client in [each for each in clients if each in ready]:
+                reply = client.hear(self.driver)
+                if reply is not None:
+                    client.answer(reply)
+                    clients.remove(client)
+            while clients and clients[0].deadline <= time.monotonic():
+                clients.pop(0).answer({"error": f"expected one line within {PATIENCE:g} s"})
+            if self._server in ready:
                 try:
-                    client.sendall(json.dumps(self._reply(client)).encode() + b"\n")
-                except OSError as error:
-                    log.warning("control client: %s", error)
+                    clients.append(_Client(self._server.accept()[0]))
+                except OSError:  # the client is gone again, there is no room for one, or this is the end
+                    time.sleep(0.01)
+                    continue
+                if len(clients) > CLIENTS:
+                    clients.pop(0).answer({"error": "too many clients"})
+        for client in clients:
+            client.socket.close()
 
-    def _reply(self, client: socket.socket) -> dict[str, Any]:
-        line = b""
-        while not line.endswith(b"\n"):
-            part = client.recv(LONGEST)
-            line += part
-            if not part or len(line) > LONGEST:
-                return {"error": f"expected one line of at most {LONGEST} bytes"}
+
+class _Client:
+    """Somebody who is at a line."""
+
+    def __init__(self, connected: socket.socket) -> None:
+        self.socket, self.line = connected, b""
+        self.deadline = time.monotonic() + PATIENCE
+        connected.setblocking(False)
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def hear(self, driver: Driver) -> dict[str, Any] | None:
+        """Take what has come, and do what it says once it is a line; the answer to that, None if more is to come."""
         try:
-            return obey(self.driver, line.decode())
+            part = self.socket.recv(LONGEST)
+        except OSError as error:
+            return {"error": str(error)}
+        self.line += part
+        if not part or len(self.line) > LONGEST:
+            return {"error": f"expected one line of at most {LONGEST} bytes"}
+        if not self.line.endswith(b"\n"):
+            return None
+        try:
+            return obey(driver, self.line.decode())
         except ValueError as error:  # undecodable text among them
             return {"error": str(error)}
+
+    def answer(self, reply: dict[str, Any]) -> None:
+        """Say it, which fits into the socket, and hang up."""
+        with self.socket:
+            try:
+                self.socket.sendall(json.dumps(reply).encode() + b"\n")
+            except OSError as error:
+                log.warning("control client: %s", error)
 
 
 def tell(path: Path, command: str) -> dict[str, Any]:
@@ -161,7 +205,7 @@ def tell(path: Path, command: str) -> dict[str, Any]:
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(2.0 * PATIENCE)
-            client.connect(str(path))
+            _connect(client, path, 2.0 * PATIENCE)
             client.sendall(command.strip().encode() + b"\n")
             with client.makefile("rb") as answer:
                 return json.loads(answer.readline())
@@ -169,11 +213,26 @@ def tell(path: Path, command: str) -> dict[str, Any]:
         raise ValueError(f"no loop answers at {path}: {error}") from None
 
 
+def _connect(client: socket.socket, path: Path, patience: float) -> None:
+    """Connect, within `patience` [s]: a loop to which many connect at once may have no room for a moment."""
+    end = time.monotonic() + patience
+    while True:
+        try:
+            return client.connect(str(path))
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.01)
+
+
 def _answers(path: Path) -> bool:
+    """Whether a loop that lives may listen there: one that is busy does, and only one that is gone refuses."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(PATIENCE)
             client.connect(str(path))
-        return True
-    except OSError:
+    except (ConnectionRefusedError, FileNotFoundError):
         return False
+    except OSError:
+        pass
+    return True

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from puck import Puck, driver_of
 
+from hiernav.runtime import control
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.control import ControlServer, tell
 from hiernav.runtime.driver import Driver
@@ -91,6 +92,66 @@ def test_a_client_that_floods_or_stalls_is_dropped(serving):
             except OSError:
                 pass
     assert "error" not in tell(path, "status")
+
+
+def connected(path: Path) -> socket.socket:
+    client = socket.socket(socket.AF_UNIX)
+    client.settimeout(60.0)
+    client.connect(str(path))
+    return client
+
+
+def test_a_stop_does_not_wait_for_clients_that_are_slow(serving, monkeypatch):
+    """They have all the time they want, and are still at their lines when the stop has been obeyed."""
+    _, path = serving
+    monkeypatch.setattr(control, "PATIENCE", 20.0)
+    slow = [connected(path) for _ in range(6)]
+    for client in slow:
+        client.sendall(b"sta")
+    tell(path, "stop")
+    until(path, mode="estop", fault="stop was commanded")
+    for client in slow:
+        with client:
+            client.sendall(b"tus\n")
+            assert b'"mode": "estop"' in client.recv(4096)
+
+
+def test_a_client_has_so_much_time_for_its_line_and_not_for_each_byte_of_it(serving, monkeypatch):
+    _, path = serving
+    monkeypatch.setattr(control, "PATIENCE", 0.3)
+    with connected(path) as client, pytest.raises(OSError):
+        for _ in range(control.LONGEST - 1):
+            client.sendall(b"x")
+            time.sleep(0.02)
+
+
+def test_of_too_many_clients_the_oldest_is_dropped_for_the_newest(serving, monkeypatch):
+    _, path = serving
+    monkeypatch.setattr(control, "PATIENCE", 60.0)
+    idle = [connected(path) for _ in range(control.CLIENTS)]
+    assert "error" not in tell(path, "stop")
+    assert b"too many clients" in idle[0].recv(4096)
+    for client in idle:
+        client.close()
+
+
+def test_a_loop_that_is_too_busy_to_be_connected_to_keeps_its_socket(tmp_path):
+    path, waiting = tmp_path / "busy.sock", []
+    with socket.socket(socket.AF_UNIX) as busy:
+        busy.bind(str(path))
+        busy.listen(0)
+        with pytest.raises(BlockingIOError):
+            for _ in range(100):
+                waiting.append(socket.socket(socket.AF_UNIX))
+                waiting[-1].setblocking(False)
+                waiting[-1].connect(str(path))
+        with pytest.raises(ValueError, match="another loop listens there"):
+            ControlServer(driver_of(), path)
+        assert path.exists()
+    for client in waiting:
+        client.close()
+    with ControlServer(driver_of(), path):  # nobody is left
+        assert "error" not in tell(path, "status")
 
 
 def test_only_this_user_may_connect_and_two_loops_do_not_share_a_socket(serving):
