@@ -51,7 +51,6 @@ class Page:
         self._rate = 0.0
         self._shown = 0
         self._events: deque[str] = deque(maxlen=12)
-        self._paused = False
         self._make_scene()
         self._make_panel()
 
@@ -114,11 +113,12 @@ class Page:
         self._state = gui.add_markdown("waiting for the first tick")
         gui.add_markdown("*Click on the floor to set the goal.*")
         for label, kind, color in (
-            ("Pause / resume", "pause", None), ("Cancel goal", "cancel", None),
+            ("Pause", "pause", None), ("Resume", "resume", None), ("Cancel goal", "cancel", None),
             ("Emergency stop", "estop", "red"), ("Acknowledge fault", "acknowledge", None),
         ):  # fmt: skip
+            # what a button asks for hangs on nothing that the page believes: others command the robot too
             button = gui.add_button(label, color=color)
-            button.on_click(lambda _event, kind=kind: self._press(kind))
+            button.on_click(lambda _event, kind=kind: self._ask(Command(kind)))
         if self.settings.faults:
             with gui.add_folder("Inject a fault"):
                 choice = gui.add_dropdown("fault", self.settings.faults)
@@ -127,12 +127,6 @@ class Page:
             self._timing = gui.add_markdown("")
         with gui.add_folder("Events"):
             self._log = gui.add_markdown("")
-
-    def _press(self, kind: Any) -> None:
-        if kind == "pause":
-            self._paused = not self._paused
-            kind = "pause" if self._paused else "resume"
-        self._ask(Command(kind))
 
     def _show_map(self, occupancy: OccupancyMap) -> None:
         first, self._map = self._map is None, occupancy

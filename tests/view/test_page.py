@@ -15,6 +15,7 @@ import urllib.request
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -144,6 +145,32 @@ def test_a_click_is_where_its_ray_meets_the_floor():
     assert on_floor((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) is None
     assert on_floor((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)) is None
     assert on_floor((0.0, 0.0, -1.0), (0.0, 0.0, -1.0)) is None
+
+
+@needs_viser
+def test_a_button_asks_for_what_it_says_however_often_it_is_pressed(monkeypatch):
+    """Somebody else may have resumed meanwhile, or the loop may have been too busy to listen."""
+    import viser
+
+    from hiernav.view.page import Page
+
+    buttons: dict[str, Callable] = {}
+
+    def add_button(label: str, **_: object) -> MagicMock:
+        return MagicMock(on_click=lambda pressed: buttons.__setitem__(label, pressed))
+
+    server = MagicMock()
+    server.gui.add_button = add_button
+    monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: server)
+    asked: list[Command] = []
+    Page(Settings("", 0.1, 0.3, 0, ()), asked.append)
+    (pause,) = (pressed for label, pressed in buttons.items() if label.startswith("Pause"))
+    pause(None)
+    pause(None)
+    assert asked == [Command("pause"), Command("pause")]
+    buttons["Resume"](None)
+    buttons["Emergency stop"](None)
+    assert asked[2:] == [Command("resume"), Command("estop")]
 
 
 @needs_viser
