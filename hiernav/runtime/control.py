@@ -140,7 +140,8 @@ class ControlServer:
         clients: list[_Client] = []  # the first to have come is the first to run out of time
         while not self._closed:
             wait = max(clients[0].deadline - time.monotonic(), 0.0) if clients else None
-            ready = select.select([self._server, *clients], [], [], wait)[0]
+            heard: list[socket.socket | _Client] = [self._server, *clients]
+            ready = select.select(heard, [], [], wait)[0]
             for client in [each for each in clients if each in ready]:
                 reply = client.hear(self.driver)
                 if reply is not None:
