@@ -332,6 +332,7 @@ class Driver:
             self._show(now, frame, truth, estimate, occupancy, decision, sent, scale)
 
     def _take_requests(self, now: float) -> None:
+        self.audience.tell(lambda observer: observer.make_requests())
         for _ in range(len(self._requests)):
             self._requests.popleft()(now)
         if self._stop_wanted is not None:

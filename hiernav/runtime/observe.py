@@ -86,6 +86,9 @@ class Observer:
     An observer that raises is dropped, and the robot drives on.
     """
 
+    def make_requests(self) -> None:
+        """Once in every tick, also where the robot cannot be read; the loop does what it is asked for in that tick."""
+
     def tick(self, record: TickRecord) -> None:
         """The end of every tick, after the action was sent."""
 

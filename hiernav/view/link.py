@@ -106,13 +106,31 @@ class ViewerLink(Observer):
         self.url = self._start(Settings(title, robot_radius, goal_radius, port, tuple(self.faults)))
         """Address of the page."""
 
-    def tick(self, record: TickRecord) -> None:
-        if self._socket is None:
-            return
+    def make_requests(self) -> None:
+        """Ask the loop for what the page asks for, as far as that does not ask too often."""
         if self.first_goal is not None:
             self.control.set_goal(self.first_goal)
             self.first_goal = None
-        self._take_commands()
+        left = COMMANDS_PER_TICK
+        for _ in range(HEARD_PER_TICK):
+            data = self._receive()
+            if data is None:
+                return
+            try:
+                command = _decode(data)
+                if command.kind == "estop":
+                    self.control.estop("stopped on the live page")
+                elif left:
+                    left -= 1
+                    self._obey(command)
+                else:
+                    self.refused += 1
+            except (msgspec.DecodeError, ValueError, KeyError):
+                self.refused += 1
+
+    def tick(self, record: TickRecord) -> None:
+        if self._socket is None:
+            return
         if abs(record.time - self._shown_at) < 1.0 / SHOW_HZ:
             return
         self._shown_at = record.time
@@ -170,25 +188,6 @@ class ViewerLink(Observer):
         except OSError:
             self._forget()
         return False
-
-    def _take_commands(self) -> None:
-        """Do what the page asks for, as far as it does not ask too often."""
-        left = COMMANDS_PER_TICK
-        for _ in range(HEARD_PER_TICK):
-            data = self._receive()
-            if data is None:
-                return
-            try:
-                command = _decode(data)
-                if command.kind == "estop":
-                    self.control.estop("stopped on the live page")
-                elif left:
-                    left -= 1
-                    self._obey(command)
-                else:
-                    self.refused += 1
-            except (msgspec.DecodeError, ValueError, KeyError):
-                self.refused += 1
 
     def _receive(self) -> bytes | None:
         """What the page says next; None if it says nothing."""

@@ -36,6 +36,7 @@ def ticks_until(link: ViewerLink, done, limit: float = 30.0) -> int:
     deadline, index = time.monotonic() + limit, 0
     while not done():
         assert time.monotonic() < deadline
+        link.make_requests()
         link.tick(record(index))
         index += 1
         time.sleep(0.005)
@@ -111,9 +112,9 @@ time.sleep(1000)
 """,
         control,
     )
-    for index in range(200):
+    for _ in range(200):
         calls, refused = len(control.calls), link.refused
-        link.tick(record(index))
+        link.make_requests()
         assert len(control.calls) - calls <= COMMANDS_PER_TICK
         assert len(control.calls) - calls + link.refused - refused <= HEARD_PER_TICK
         time.sleep(0.001)
@@ -135,7 +136,7 @@ time.sleep(1000)
         control,
     )
     until(said.exists)
-    link.tick(record(0))
+    link.make_requests()
     assert control.calls == [("goal", float(k), 0.0) for k in range(COMMANDS_PER_TICK)] + [("estop",)]
     assert link.refused == 100 - COMMANDS_PER_TICK
     link._process.kill()
@@ -155,7 +156,7 @@ time.sleep(1000)
         control,
     )
     until(full.exists)
-    link.tick(record(0))
+    link.make_requests()
     assert link.refused > 100
     assert link._receive() is None
     link._process.kill()

@@ -12,6 +12,7 @@ from puck import GOAL, Listener, Puck, Scripted, driver_of
 
 from hiernav.runtime.driver import REQUESTS
 from hiernav.runtime.observe import TickRecord
+from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
 
 PERIOD = 0.02
@@ -73,7 +74,37 @@ time.sleep(1000)
         driver.audience.observers = [page]
         driver.serve()
         page._process.kill()
-    assert modes == [Mode.READY, Mode.ESTOP] and driver.supervisor.fault == "stopped on the live page"
+    assert modes == [Mode.ESTOP, Mode.ESTOP] and driver.supervisor.fault == "stopped on the live page"
+
+
+def test_a_page_is_listened_to_where_the_robot_cannot_be_read():
+    """It acknowledges the fault, which comes again, and then stops what cannot be read."""
+    driver, seen = driver_of(Puck(control_period=PERIOD)), Listener()
+    program = """
+def wait_for(text):
+    while text not in link.recv(1000000): pass
+wait_for(b"bus error")
+say(kind="acknowledge")
+wait_for(b"acknowledged")
+say(kind="estop")
+time.sleep(1000)
+"""
+
+    def unreadable() -> SensorFrame:
+        time.sleep(1e-3)
+        if driver.supervisor.mode is Mode.ESTOP or time.monotonic() > deadline:
+            driver.quit()
+        raise OSError("bus error")
+
+    driver.robot.read = unreadable
+    deadline = time.monotonic() + 60.0
+    with closing(link_to(program, driver)) as page:
+        driver.audience.observers = [page, seen]
+        driver.serve()
+        page._process.kill()
+    modes = [event.values["mode"] for event in seen.events if event.kind == "mode"]
+    assert modes == ["fault", "init", "fault", "estop"]
+    assert driver.robot.log[-1] == "brake" and not seen.records
 
 
 @pytest.mark.parametrize("floods", ["ask(goal)", "send(goal)"])
