@@ -54,11 +54,12 @@ def keep(news: int, questions: int, memory: PlannerMemory) -> None:
             os.close(watched)
             planner, watched = 0, -1
         if not planner:
-            if memory.status.restarts < MAX_RESTARTS:
+            exhausted = memory.status.restarts >= MAX_RESTARTS
+            memory.set_status("exhausted", int(exhausted))  # before the start, by which it is told to be over
+            if not exhausted:
                 memory.set_status("restarts", memory.status.restarts + 1)
                 planner = _start(news, questions, memory)
                 watched = os.pidfd_open(planner)
-            memory.set_status("exhausted", int(not planner))
     if planner:
         os.kill(planner, signal.SIGKILL)
         os.waitpid(planner, 0)

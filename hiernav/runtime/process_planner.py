@@ -92,7 +92,7 @@ class ProcessPlanner:
         self._map_version = 0
         self._visits: VisitMap | None = None
         self._silent_since: float | None = None
-        self._newest_start = 0
+        self._newest_start = self._renewed_after = 0
         self._ended_counts: Counter[str] = Counter()
         self._newest_counts: Counter[str] = Counter()
 
@@ -110,7 +110,7 @@ class ProcessPlanner:
     @property
     def failed(self) -> str | None:
         status = self.status
-        if status.exhausted:
+        if status.exhausted and status.starts > self._renewed_after:  # else the keeper is about to start another one
             return f"the planner's process failed again after {status.restarts} restarts"
         code = self._child.ended
         return None if code is None else f"the planner's keeper ended with status {code}"
@@ -123,6 +123,7 @@ class ProcessPlanner:
         return dict(self._ended_counts + self._newest_counts)
 
     def renew(self) -> None:
+        self._renewed_after = self.status.starts
         self._child.nudge(b"f")
         self._silent_since = None
 

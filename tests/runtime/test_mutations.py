@@ -71,7 +71,7 @@ MUTANTS = (
            f"{F}/test_28_pinned.py"),
     Mutant("hanging planner", f"{R}/process_planner.py", 'self._child.nudge(b"r")', "pass",
            f"{F}/test_09_planner_hangs.py::test_a_hanging_process_is_replaced_three_times_and_then_given_up"),
-    Mutant("killed planner", f"{R}/planner_process.py", "if memory.status.restarts < MAX_RESTARTS:", "if False:",
+    Mutant("killed planner", f"{R}/planner_process.py", "memory.status.restarts >= MAX_RESTARTS", "True",
            f"{F}/test_10_planner_killed.py"),
     Mutant("late plan", f"{R}/pilot.py", "if not 0.0 <= stamp - answer.stamp <= self.max_age:", "if False:",
            f"{F}/test_09_planner_hangs.py::test_an_answer_that_comes_too_late_is_not_followed"),

@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -104,6 +104,34 @@ def test_a_hanging_process_is_replaced_three_times_and_then_given_up(planner):
     while planner.failed is not None and time.monotonic() < end:
         time.sleep(0.01)
     assert ask(planner) is not None and planner.restart_count() == 1
+
+
+def until(done: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60.0
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def kill_until_it_fails(planner: ProcessPlanner, restarts: range) -> None:
+    for count in restarts:
+        until(lambda count=count: planner.ready and planner.restart_count() == count)
+        os.kill(planner.status.pid, signal.SIGKILL)
+    until(lambda: planner.failed is not None)
+
+
+def test_a_failure_that_was_acknowledged_is_not_told_of_again_before_its_keeper_has_looked(planner):
+    """A goal that is set in the same breath is driven to; the keeper, here, takes its time."""
+    kill_until_it_fails(planner, range(4))
+    keeper = planner._child.process.pid
+    os.kill(keeper, signal.SIGSTOP)
+    try:
+        planner.renew()
+        assert planner.failed is None
+    finally:
+        os.kill(keeper, signal.SIGCONT)
+    assert ask(planner) is not None and planner.restart_count() == 1
+    kill_until_it_fails(planner, range(1, 4))
 
 
 def test_a_planner_is_given_the_longer_the_larger_the_map_is():
