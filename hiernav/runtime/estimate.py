@@ -82,8 +82,10 @@ class EstimatorConfig:
                     f"EstimatorConfig.{first} = {getattr(self, first)} must be less than {second} = "
                     f"{getattr(self, second)}"
                 )
-        if not math.hypot(*self.magnetic_field[:2]) > 0.0:
-            raise ValueError(f"EstimatorConfig.magnetic_field = {self.magnetic_field} must have a horizontal part")
+        if not (all(map(math.isfinite, self.magnetic_field)) and math.hypot(*self.magnetic_field[:2]) > 0.0):
+            raise ValueError(
+                f"EstimatorConfig.magnetic_field = {self.magnetic_field} must be finite and have a horizontal part"
+            )
 
 
 @dataclass(frozen=True)

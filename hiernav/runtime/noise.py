@@ -38,6 +38,8 @@ class SensorNoise:
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
                 raise ValueError(f"SensorNoise.{name} = {value} must be finite and not negative")
+        if not all(map(math.isfinite, self.gyro_bias)):
+            raise ValueError(f"SensorNoise.gyro_bias = {self.gyro_bias} rad/s must be finite")
         for name in ("dropout", "fix_dropout"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"SensorNoise.{name} = {getattr(self, name)} must be a probability")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import math
 import os
 import resource
 from collections.abc import Callable
@@ -33,6 +34,10 @@ class RealtimeConfig:
     """Time before each tick from which on one is rehearsed, so that the caches are warm [s]; 0 for none."""
     freeze_gc: bool = True
     """Move everything allocated so far out of the garbage collector's sight."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.rehearsal < math.inf:
+            raise ValueError(f"RealtimeConfig.rehearsal = {self.rehearsal} s must be finite and not negative")
 
 
 def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:

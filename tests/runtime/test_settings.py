@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import get_args, get_origin, get_type_hints
 
 import pytest
 from shipped import ROOT
@@ -42,6 +46,42 @@ def test_what_is_not_a_setting_is_refused_with_its_name(override, why):
     with pytest.raises(ConfigError) as refused:
         load_settings(None, [override])
     assert why in str(refused.value)
+
+
+def places(section: str = "", kind: object = Settings) -> Iterator[tuple[str, int | None]]:
+    """Every setting that is a number with a fraction, and the length of those that are several."""
+    for name, each in get_type_hints(kind).items():
+        if is_dataclass(each):
+            yield from places(name, each)
+        elif get_origin(each) is tuple and float in get_args(each):
+            yield f"{section}.{name}", len(get_args(each))
+        elif each is float or float in get_args(each):
+            yield f"{section}.{name}", None
+
+
+PLACES = dict(places())
+
+
+def test_the_places_of_numbers_are_found():
+    assert PLACES["estimator.magnetic_field"] == PLACES["noise.gyro_bias"] == 3
+    assert {"realtime.rehearsal", "guard.slow_ttc", "driver.goal_radius"} <= PLACES.keys()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", PLACES)
+def test_what_is_not_finite_is_refused_wherever_it_stands_with_key_and_value(tmp_path: Path, place: str, value: float):
+    section, _, key = place.partition(".")
+    length, text = PLACES[place], f".{value}".replace(".-", "-.")
+    for at in range(length or 1):
+        given = text if length is None else str(["0.1"] * at + [text] + ["0.1"] * (length - at - 1)).replace("'", "")
+        with pytest.raises(ConfigError) as refused:
+            load_settings(None, [f"{place}={given}"])
+        said = str(refused.value)
+        assert said.startswith(f"command line: {place}: ") and str(value) in said
+        file = tmp_path / "s.yaml"
+        file.write_text(f"{section}: {{{key}: {given}}}\n")
+        with pytest.raises(ConfigError, match=rf"s\.yaml: {section}: .*{value}"):
+            load_settings(file)
 
 
 @pytest.mark.parametrize(
