@@ -79,6 +79,19 @@ class DriverConfig:
             raise ValueError(f"DriverConfig.plan_slow = {self.plan_slow} must be less than plan_hold")
 
 
+@dataclass
+class _Seen:
+    """How far a tick has come."""
+
+    frame: SensorFrame
+    truth: Truth | None
+    estimate: Estimate | None
+    occupancy: OccupancyMap | None = None
+    decision: Decision | None = None
+    sent: np.ndarray | None = None
+    scale: float = 1.0
+
+
 class Driver:
     """Ties robot, estimator, agent and guard together, one tick at a time.
 
@@ -218,6 +231,7 @@ class Driver:
         self._told: tuple[str, str | None] = ("", None)
         self._estimate, self._restarts = None, None
         self._last_frame: SensorFrame | None = None
+        self._unshown: _Seen | None = None
         self._occupancy: OccupancyMap | None = None
         self._loop_ticks = self.loop.ticks
         self._terms = TermHold()
@@ -276,6 +290,7 @@ class Driver:
         except Exception as error:
             self._take_failure(error, now)
             self.robot.brake()
+            self._show(now)  # what the estimator has taken must not be missing in a recording
         return self.gone is not None or (not self._serving and self._trip is None)
 
     def _take_failure(self, error: Exception, now: float) -> None:
@@ -291,12 +306,14 @@ class Driver:
 
     def _step(self, now: float) -> None:
         timer, supervisor = self.timer, self.supervisor
+        self._unshown = None
         timer.begin()
         try:
             frame = self._last_frame = self.robot.read()
             truth = self._truth() if self._truth is not None and self.audience else None
             timer.mark("read")
             self._estimate = estimate = self.estimator.update(frame)
+            self._unshown = seen = _Seen(frame, truth, estimate)
             timer.mark("estimate")
         except Exception:
             self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
@@ -305,31 +322,28 @@ class Driver:
         trust, doubt = self._blind.check(estimate, now)
         late = self._overruns.check(self.loop.overruns_in_a_row)
         stamp = frame.stamp if estimate is None else estimate.stamp
-        occupancy = decision = sent = None
-        scale = 1.0
         if self._trip is not None:
             self._trip.last = stamp
         if trust is Trust.LOST and self._trip is not None:
             self._fail(doubt, now)
         if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
-            occupancy = self._occupancy = self.occupancy(stamp)
+            seen.occupancy = occupancy = self._occupancy = self.occupancy(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
-                decision = self._decide(self._trip, frame, estimate, occupancy, now)
+                seen.decision = self._decide(self._trip, frame, estimate, occupancy, now)
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
-            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else late, stamp, now)
-        if supervisor.driving and decision is not None and estimate is not None and occupancy is not None:
-            sent, scale = self._send(decision, estimate, occupancy, now)
-        if sent is None:
+            self._choose_mode(self._trip, seen.decision, doubt if trust is Trust.HOLD else late, stamp, now)
+        if supervisor.driving and seen.decision is not None and estimate is not None and seen.occupancy is not None:
+            seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, now)
+        if seen.sent is None:
             self.robot.brake()
             self.guard.braked()
             timer.mark("send")
             self._check_stop(estimate, now)
         timer.end()
-        if self.audience:
-            self._show(now, frame, truth, estimate, occupancy, decision, sent, scale)
+        self._show(now)
 
     def _take_requests(self, now: float) -> None:
         self.audience.tell(lambda observer: observer.make_requests())
@@ -534,17 +548,12 @@ class Driver:
     def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         self.audience.emit(kind, text, now, **values)
 
-    def _show(
-        self,
-        now: float,
-        frame: SensorFrame,
-        truth: Truth | None,
-        estimate: Estimate | None,
-        occupancy: OccupancyMap | None,
-        decision: Decision | None,
-        sent: np.ndarray | None,
-        scale: float,
-    ) -> None:
+    def _show(self, now: float) -> None:
+        """Tell of a tick, as far as it came, unless that was done."""
+        seen, self._unshown = self._unshown, None
+        if seen is None or not self.audience:
+            return
+        decision, estimate = seen.decision, seen.estimate
         trip = self._trip or self._ended
         plan: dict[str, object] = {}
         if decision is not None and estimate is not None:
@@ -556,6 +565,7 @@ class Driver:
                 "plan_age": None if stamp is None else estimate.stamp - stamp,
                 "reason": decision.reason,
                 "replanned": decision.replanned,
+                "recovering": decision.recovering,
                 "observation": decision.observation,
                 "proposed": decision.action,
             }
@@ -564,13 +574,13 @@ class Driver:
             time=now,
             lateness=self.loop.late,
             mode=self.supervisor.mode,
-            frame=frame,
+            frame=seen.frame,
             goal=None if trip is None else trip.goal,
-            occupancy=occupancy,
+            occupancy=seen.occupancy,
             estimate=estimate,
-            truth=truth,
-            sent=sent,
-            speed_scale=scale,
+            truth=seen.truth,
+            sent=seen.sent,
+            speed_scale=seen.scale,
             timings=self.timer.last,
             **plan,  # type: ignore[arg-type]
         )

@@ -119,6 +119,8 @@ class Tick(Message, frozen=True):
     with_plan: bool
     """Whether it followed the waypoints of the last plan message."""
     timings: dict[str, float]
+    recovering: bool | None = None
+    """None in recordings from before it was told: they say as much by the mode, but not where the robot was held."""
 
 
 class EventMessage(Message, frozen=True):
@@ -210,6 +212,7 @@ class TickEncoder:
             with_map=record.occupancy is not None,
             with_plan=plan is not None,
             timings=dict(record.timings),
+            recovering=record.recovering,
         )
         yield "/tick", _encode(tick)
 
@@ -292,6 +295,7 @@ class TickDecoder:
             plan_age=_float(tick.plan_age),
             occupancy=self._map if tick.with_map else None,
             timings=tick.timings,
+            recovering=tick.mode == Mode.RECOVERING.value if tick.recovering is None else tick.recovering,
             **parts,
         )
 

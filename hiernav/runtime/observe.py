@@ -22,6 +22,7 @@ class TickRecord:
     """Everything about one tick. Nothing in it is written again, so it may be kept and read from other threads.
 
     What a braked tick did not come to is None: without an estimate nothing is decided, without a goal nothing planned.
+    A tick that failed is told of as far as it came, if the estimator took its frame.
     """
 
     index: int
@@ -54,6 +55,8 @@ class TickRecord:
     """Why the plan before this tick ended and a new one was asked for."""
     replanned: bool = False
     """Whether a new plan is followed from this tick on; with a planner in its own process that is later than asked."""
+    recovering: bool = False
+    """Whether those waypoints are a way out that the robot is shown where it is stuck, whatever its mode."""
     observation: np.ndarray | None = None
     """(D,) float32, what the skill saw."""
     proposed: np.ndarray | None = None

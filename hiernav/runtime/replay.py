@@ -23,7 +23,6 @@ from hiernav.runtime.guard import Guard
 from hiernav.runtime.log_reader import LogError, RunLog
 from hiernav.runtime.observe import Event, TickRecord
 from hiernav.runtime.policy import load_policies, make_agent, make_planner
-from hiernav.runtime.supervisor import Mode
 from hiernav.runtime.terms import TermHold
 
 ASKED = 256
@@ -96,7 +95,6 @@ class Replay:
         self._agent.recovery = self._recovery = _Recorded(1, self._agent.control_period)
         self._estimator = Estimator(about.estimator)
         self._guard = Guard(bundle.golden["action"].shape[1], about.guard)
-        self._mode = Mode.INIT
         self._begin()
 
     def compare(self, progress: Callable[[int], None] = lambda ticks: None) -> Comparison:
@@ -143,20 +141,13 @@ class Replay:
         """The loop was started: the estimator knows nothing."""
         self._estimator.reset()
         self._terms = TermHold()
-        self._waits = False
 
     def _happened(self, event: Event) -> None:
-        option = self._agent.option
         if event.kind == "goal" and "x" in event.values:
             self._agent.reset()
             self._guard.reset()
         elif event.kind == "plan":
-            option.drop()
-        elif event.kind == "mode":
-            recovered = self._mode is Mode.RECOVERING and event.values.get("mode") == Mode.RUNNING.value
-            self._waits |= recovered
-            self._mode = Mode(event.values["mode"])
-            self._recovery.active[0] &= self._mode is Mode.RECOVERING
+            self._agent.option.drop()
 
     def _values(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
         """Name, recorded and replayed value of everything that was computed in a tick."""
@@ -168,9 +159,6 @@ class Replay:
             yield "sent", tick.sent, self._guarded(tick, tick.proposed)
         elif tick.sent is None:
             self._guard.braked()
-        if self._waits:
-            # as after a recovery: another plan is asked for at the next tick
-            self._agent.option.waiting[0], self._waits = True, False
 
     def _guarded(self, tick: TickRecord, proposed: np.ndarray) -> np.ndarray:
         estimate = tick.estimate
@@ -187,7 +175,7 @@ class Replay:
             if tick.replanned:
                 yield from self._answer(tick, self._asked)
         terms = self._terms.fill(tick.frame)
-        self._recovery.plan = tick.plan if tick.mode is Mode.RECOVERING else None
+        self._recovery.plan = tick.plan if tick.recovering else None
         step = self._agent.act(tick.estimate.pose[None], terms, tick.goal[None], (tick.occupancy,))
         yield "reason", int(tick.reason), int(step.reason[0])
         yield "plan", tick.plan, step.plan[0]
@@ -201,7 +189,7 @@ class Replay:
             yield "plan", tick.plan, None
             return
         plan = np.asarray(self._planner.plan(query), dtype=np.float64)[0]
-        if tick.mode is not Mode.RECOVERING:
+        if not tick.recovering:
             yield "plan", tick.plan, plan
             plan = tick.plan
         self._agent.option.adopt(0, plan, tick.plan_start, query.occupancy[0])
@@ -215,11 +203,12 @@ class _Recorded(Recovery):
     def __call__(
         self, pose: np.ndarray, plan: np.ndarray, occupancy: Sequence[OccupancyMap], rows: np.ndarray | None = None
     ) -> np.ndarray:
-        position, begins = pose[:, :2], self.plan is not None and not self.active[0]
+        position, was = pose[:, :2], bool(self.active[0])
         self._forget(np.zeros(1, dtype=np.intp), position)
-        if begins:
+        active = self.plan is not None
+        if active and not was:
             self._remember(0, position[0])
-        self.active[0], self._quiet = self.plan is not None, not self._tries.any()
+        self.active[0], self.ended[0], self._quiet = active, was and not active, not self._tries.any()
         return plan if self.plan is None else self.plan[None]
 
 

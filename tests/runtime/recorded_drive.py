@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise, SimRobot
-from hiernav.sim.layout import GOAL_RADIUS, parse_world
+from hiernav.sim.layout import GOAL_RADIUS, Layout, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
 
@@ -73,26 +74,71 @@ def drive(
 
     `damage` is done to every frame; from the time `pinned_from` [s] on no command reaches the robot.
     """
-    spec, layout = get_robot("point"), sample_layout(parse_world(world), seed, get_robot("point").radius)
-    robot = SimRobot(spec, layout, noise, seed)
-    driver = Driver(
-        _Hindered(robot, damage, pinned_from),
-        Pilot(make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS)),
-        robot.occupancy,
-        FakeClock(),
-        Estimator(ESTIMATOR),
-        config=DriverConfig(goal_radius=GOAL_RADIUS, max_steps=layout.spec.max_steps),
-        observers=observers,
-    )
-    try:
+    layout = sample_layout(parse_world(world), seed, get_robot("point").radius)
+    with _driver(layout, noise, damage, pinned_from) as driver:
+        driver.audience.observers = list(observers)
         return driver.run(layout.goal, max_steps)
+
+
+class Operator(Observer):
+    """Commands a loop that serves: `at(tick, record)` is called after each of its ticks, up to the last."""
+
+    driver: Driver
+    goal: np.ndarray
+
+    def __init__(self, last: int, at: Callable[[Operator, int, TickRecord], None]) -> None:
+        self._last, self._at, self.ticks = last, at, 0
+
+    def tick(self, record: TickRecord) -> None:
+        self._at(self, self.ticks, record)
+        self.ticks += 1
+        if self.ticks > self._last:
+            self.driver.quit()
+
+
+def serve(
+    operator: Operator,
+    *observers: Observer,
+    pinned_from: float = math.inf,
+    pinned_until: float = math.inf,
+    fails_at: int = -1,
+) -> None:
+    """Have the point robot wait for what an operator commands; `send` fails once, the `fails_at`-th time."""
+    layout = sample_layout(parse_world("pillar(2,2,10)"), 0, get_robot("point").radius)
+    with _driver(layout, None, lambda frame: frame, pinned_from, pinned_until, fails_at) as driver:
+        operator.driver, operator.goal = driver, layout.goal
+        driver.audience.observers = [operator, *observers]
+        driver.serve()
+
+
+@contextmanager
+def _driver(layout: Layout, noise: SensorNoise | None, *hindrances: Any) -> Iterator[Driver]:
+    spec = get_robot("point")
+    robot = SimRobot(spec, layout, noise, layout.seed)
+    try:
+        yield Driver(
+            _Hindered(robot, *hindrances),
+            Pilot(make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS)),
+            robot.occupancy,
+            FakeClock(),
+            Estimator(ESTIMATOR),
+            config=DriverConfig(goal_radius=GOAL_RADIUS, max_steps=layout.spec.max_steps),
+        )
     finally:
         robot.close()
 
 
 class _Hindered:
-    def __init__(self, robot: SimRobot, damage: Callable[[SensorFrame], SensorFrame], pinned_from: float) -> None:
-        self._robot, self._damage, self._pinned_from = robot, damage, pinned_from
+    def __init__(
+        self,
+        robot: SimRobot,
+        damage: Callable[[SensorFrame], SensorFrame],
+        pinned_from: float,
+        pinned_until: float = math.inf,
+        fails_at: int = -1,
+    ) -> None:
+        self._robot, self._damage, self._fails_at = robot, damage, fails_at
+        self._pinned_from, self._pinned_until, self._sent = pinned_from, pinned_until, 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._robot, name)
@@ -101,7 +147,10 @@ class _Hindered:
         return self._damage(self._robot.read())
 
     def send(self, action: np.ndarray) -> np.ndarray:
-        pinned = self._robot.truth().time >= self._pinned_from
+        self._sent += 1
+        if self._sent == self._fails_at:
+            raise OSError("bus error")
+        pinned = self._pinned_from <= self._robot.truth().time < self._pinned_until
         sent = self._robot.send(np.zeros_like(action) if pinned else action)
         return action if pinned else sent
 

@@ -8,15 +8,16 @@ import numpy as np
 import onnx
 import pytest
 from onnx import numpy_helper
-from recorded_drive import BUNDLE, about, drive
+from recorded_drive import BUNDLE, Operator, about, drive, serve
 
 from hiernav import cli
 from hiernav.nav.bundle import Bundle, load_bundle
 from hiernav.nav.occupancy import VisitMap, empty_map
 from hiernav.nav.option import PlanQuery
 from hiernav.nav.recovery import Recovery
+from hiernav.runtime import messages
 from hiernav.runtime.log_reader import LogError, RunLog
-from hiernav.runtime.observe import Observer
+from hiernav.runtime.observe import Observer, TickRecord
 from hiernav.runtime.policy import OnnxSkill
 from hiernav.runtime.recorder import Recorder
 from hiernav.runtime.replay import ASKED, Replay, _Asked, _Recorded
@@ -82,6 +83,65 @@ def test_a_clock_that_starts_again_and_a_stamp_far_ahead_are_replayed_too(tmp_pa
     result = Replay(log, bundle).compare()
     assert result.equal, result.difference
     assert result.compared["sent"] > 150
+
+
+def served(path, operator, **hindrances):
+    """A recording of a loop that serves."""
+    recorder = Recorder(path, about().metadata())
+    serve(operator, recorder, **hindrances)
+    recorder.close()
+    return RunLog(path)
+
+
+def test_a_drive_after_a_tick_that_failed_is_replayed_too(tmp_path, bundle):
+    """The estimator has taken its frame, and the skill decided; then the command was not taken."""
+
+    def command(operator, tick, record):
+        if record.mode is Mode.FAULT:
+            operator.driver.acknowledge()
+        if tick == 3 or record.mode is Mode.FAULT:
+            operator.driver.set_goal(operator.goal)
+
+    log = served(tmp_path / "failed.mcap", Operator(80, command), fails_at=20)
+    ticks = list(log.ticks())
+    assert [tick.index for tick in ticks] == list(range(len(ticks)))
+    (failed,) = (tick for tick in ticks if tick.mode is Mode.FAULT)
+    assert failed.proposed is not None and failed.sent is None
+    assert sum(tick.sent is not None for tick in ticks[failed.index :]) > 20
+    result = Replay(log, bundle).compare()
+    assert result.equal and result.ticks == len(ticks), result.difference
+
+
+@pytest.mark.parametrize("last", [0, 5])
+def test_a_robot_that_is_paused_while_it_recovers_is_replayed_too(tmp_path, bundle, last):
+    """In the tick in which it is made to wait it is still shown its way out."""
+    recovering: list[int] = []
+
+    def command(operator, tick, record):
+        if tick == 3:
+            operator.driver.set_goal(operator.goal)
+        if record.mode is Mode.RECOVERING:
+            recovering.append(tick)
+        if recovering and tick == recovering[0] + last:
+            operator.driver.pause()
+        if recovering and tick == recovering[0] + last + 20:
+            operator.driver.resume()
+
+    log = served(tmp_path / "paused.mcap", Operator(250, command), pinned_from=0.3, pinned_until=2.6)
+    assert len([tick for tick in log.ticks() if tick.recovering and tick.mode is Mode.HOLD]) == 1
+    result = Replay(log, bundle).compare()
+    assert result.equal and result.compared["sent"] > 50, result.difference
+
+
+def test_a_recording_from_before_recovering_was_told_says_so_by_its_mode():
+    for mode in (Mode.RECOVERING, Mode.RUNNING):
+        decoder = messages.TickDecoder()
+        for topic, data in messages.TickEncoder().encode(TickRecord(0, 0.0, 0.0, mode, SensorFrame(0.0))):
+            values = json.loads(data)
+            if topic == "/tick":
+                assert values.pop("recovering") is False
+            read = decoder.add(messages.decode(topic, json.dumps(values).encode()))
+        assert read.recovering == (mode is Mode.RECOVERING)
 
 
 def test_questions_of_the_same_stamp_are_kept_once():
