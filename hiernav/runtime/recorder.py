@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import logging
 import queue
+import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
 from hiernav.runtime import messages
@@ -28,11 +31,14 @@ CHUNK_SECONDS = 1.0
 ABOUT = "hiernav"
 """Name of the metadata record that says what was run."""
 
+_CHUNK_INDICES = "_Writer__chunk_indices"
+"""Where the writer collects what it puts at the end of the file: 3 MB an hour, were they kept in memory."""
+
 log = logging.getLogger(__name__)
 
 
 class Recorder(Observer):
-    """Writes every tick and event to an MCAP file."""
+    """Writes every tick and event to an MCAP file, in memory that does not grow with it."""
 
     def __init__(self, path: str | Path, about: Mapping[str, str] | None = None) -> None:
         """
@@ -56,6 +62,8 @@ class Recorder(Observer):
         self._encoder = messages.TickEncoder()
         self._unreadable = False
         self._writer = Writer(self._file)
+        self._indices = _ChunkIndices(self.path.parent)
+        setattr(self._writer, _CHUNK_INDICES, self._indices)
         self._writer.start(profile=PROFILE, library="hiernav")
         self._writer.add_metadata(ABOUT, dict(about or {}))
         self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}
@@ -114,6 +122,7 @@ class Recorder(Observer):
                 self._file.close()
             except OSError:
                 pass
+        self._indices.close()
         self._release_waiting()
 
     def _write_all(self) -> None:
@@ -163,3 +172,26 @@ class Recorder(Observer):
                 return
             if isinstance(item, threading.Event):
                 item.set()
+
+
+class _ChunkIndices:
+    """In the place of a list of the file's chunks: keeps them in a file of its own, which has no name."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(buffering=0, dir=folder)
+
+    def append(self, index: ChunkIndex) -> None:
+        record = RecordBuilder()
+        index.write(record)
+        self._file.write(record.end())
+
+    def __iter__(self) -> Iterator[_ChunkIndices]:
+        """All of them in one, which the writer has write itself."""
+        yield self
+
+    def write(self, summary: RecordBuilder) -> None:
+        self._file.seek(0)
+        summary.write(self._file.read())
+
+    def close(self) -> None:
+        self._file.close()

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import gc
 import json
 import math
 import threading
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -125,6 +127,29 @@ def test_flush_brings_everything_to_the_disk_while_the_file_goes_on(tmp_path):
     assert not log.complete
     writer.close()
     assert list(log) and log.complete
+
+
+def test_memory_does_not_grow_with_a_recording_which_ends_with_an_index_of_all_of_it(tmp_path):
+    record = TickRecord(index=0, time=0.0, lateness=0.0, mode=Mode.RUNNING, frame=SensorFrame(0.0))
+    writer, used = Recorder(tmp_path / "long.mcap"), {}
+    tracemalloc.start()
+    try:
+        for index in range(1200):
+            writer.tick(replace(record, index=index, time=float(index)))
+            writer.flush(10.0)
+            if index in (199, 1199):
+                gc.collect()
+                used[index] = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert used[1199] - used[199] < 100_000
+    writer.close()
+    assert writer.error is None and [path.name for path in tmp_path.iterdir()] == ["long.mcap"]
+    with writer.path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert len(reader.get_summary().chunk_indexes) == 1200
+        late = reader.iter_messages(topics=["/tick"], starting_at=int(1000e9))
+        assert [json.loads(message.data)["index"] for _, _, message in late] == list(range(1000, 1200))
 
 
 def test_several_runs_share_a_file(tmp_path):
