@@ -101,14 +101,14 @@ class FixedRateLoop:
         self._leaving, self._signalled = True, False
         exit_reason = LoopExit.DONE
         with self._signals():
-            # Two levels: a signal in the few instructions before `_leaving` is set still finds a `finally` around it.
+            # Two levels: a signal in the few instructions before `_leaving` is set still finds an `except` around it.
             try:
                 try:
                     self._run()
-                except KeyboardInterrupt:
-                    exit_reason = LoopExit.INTERRUPTED
                 finally:
                     self._leaving = True
+            except KeyboardInterrupt:
+                exit_reason = LoopExit.INTERRUPTED
             finally:
                 self._stopped = False  # not at the beginning: a stop that comes just before it must not be lost
                 self._brake_for_sure()
@@ -120,7 +120,8 @@ class FixedRateLoop:
             raise Interrupted("before the first tick")
         start = self.clock.now()
         index = 0
-        while not self._stopped:
+        # what `interrupt` raises may be swallowed, as in a `__del__`: the signal counts all the same
+        while not (self._stopped or self._signalled):
             deadline = start + index * self.period
             if self._prepare is not None and self.clock.now() < deadline - self._ahead:
                 self.clock.sleep_until(deadline - self._ahead)

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -151,6 +152,50 @@ def test_a_signal_brakes_and_returns(number):
     assert FixedRateLoop(FakeClock(), PERIOD, tick, brakes).run() is LoopExit.INTERRUPTED
     assert brakes.calls == 1
     assert signal.getsignal(number) is before
+
+
+def test_a_signal_that_code_of_a_tick_swallows_ends_the_loop_after_that_tick():
+    brakes, ticks = Brakes(), []
+
+    def tick(now: float) -> bool:
+        ticks.append(now)
+        if len(ticks) == 2:
+            with suppress(BaseException):  # as Python does with what a `__del__` raises
+                signal.raise_signal(signal.SIGTERM)
+        return len(ticks) == 9
+
+    assert FixedRateLoop(FakeClock(), PERIOD, tick, brakes).run() is LoopExit.INTERRUPTED
+    assert (len(ticks), brakes.calls) == (2, 1)
+
+
+def test_a_signal_brakes_and_returns_wherever_in_the_loop_it_arrives():
+    codes = (FixedRateLoop.run.__code__, FixedRateLoop._run.__code__)
+    places = {(code.co_name, line) for code in codes for _, _, line in code.co_lines() if line}
+    arrived = []
+
+    def run_with_signal_at(place: tuple[str, int]) -> None:
+        brakes, before = Brakes(), signal.getsignal(signal.SIGINT)
+
+        def trace(frame, event, argument):
+            handler = signal.getsignal(signal.SIGINT)
+            here = (frame.f_code.co_name, frame.f_lineno)
+            if event == "line" and here == place and place not in arrived and handler is not before:
+                arrived.append(place)
+                handler(signal.SIGINT, frame)
+            return trace if frame.f_code in codes else None
+
+        sys.settrace(trace)
+        try:
+            FixedRateLoop(FakeClock(), PERIOD, lambda now: True, brakes).run()
+        except KeyboardInterrupt:
+            pytest.fail(f"line {place[1]} of loop.py raises what is an interruption")
+        finally:
+            sys.settrace(None)
+        assert brakes.calls == 1
+
+    for place in sorted(places):
+        run_with_signal_at(place)
+    assert len(arrived) > 15
 
 
 def test_a_second_signal_does_not_cut_the_braking_short():
