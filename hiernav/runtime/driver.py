@@ -623,8 +623,8 @@ class Driver:
             return stopped is not None
 
         try:
-            loop = FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake)
-            self.interrupted |= loop.run() is LoopExit.INTERRUPTED
+            # however often somebody asks for an end: `_loop` notes it, and the robot is braked until it stands
+            FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake, handle_signals=False).run()
         except Exception:
             log.exception("the stop could not be verified")
             return False

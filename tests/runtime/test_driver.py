@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -105,6 +106,29 @@ def test_a_keyboard_interrupt_stops_the_robot():
     assert (result.reason, result.stopped) == ("interrupted", True)
     assert robot.log[-1] == "brake"
     assert driver.supervisor.mode is Mode.INIT
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_signals_while_the_robot_rolls_out_do_not_cut_its_stop_short(first):
+    """Both where a signal had ended the drive, and where it comes at the goal."""
+
+    class Rolling(Puck):
+        def brake(self) -> None:
+            self.log.append("brake")
+            signal.raise_signal(signal.SIGINT if len(self.log) % 2 else signal.SIGTERM)
+            self._move(0.8 * self.velocity)
+
+    def script(step: int, straight: np.ndarray) -> np.ndarray:
+        if first and step == 8:
+            signal.raise_signal(signal.SIGINT)
+        return straight
+
+    robot = Rolling(noise=1e-3)
+    driver = driver_of(robot, Scripted(script))
+    result = driver.run(GOAL)
+    assert (result.reason, result.stopped, result.fault) == ("interrupted" if first else "goal", True, None)
+    assert driver.interrupted and driver.supervisor.mode is Mode.INIT
+    assert np.linalg.norm(robot.velocity) < 0.1
 
 
 def test_a_robot_that_does_not_stop_is_a_fault():
