@@ -141,6 +141,7 @@ class Driver:
         self.last_result: RunResult | None = None
         """Of the goal that ended last."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
+        self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
         self._requests: deque[Callable[[float], None]] = deque(maxlen=REQUESTS)
         self._trip: Trip | None = None
         self._ended: Trip | None = None
@@ -255,6 +256,8 @@ class Driver:
                 self._end_trip("interrupted", self.clock.now())
             self.audience.tell(lambda observer: observer.flush(FLUSH_SECONDS))
             stopped = self._stop()
+            if stopped:
+                self._stands()
             if self._ended is not None:
                 if not stopped:
                     self._does_not_stop(self.clock.now())

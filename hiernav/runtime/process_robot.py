@@ -69,6 +69,7 @@ class ProcessRobot:
         self._facts: dict[str, Any] | None = None
         self._message: bytes | None = None
         self._newest: tuple[SensorFrame, Truth | None] | None = None
+        self._driven = False
 
     @property
     def control_period(self) -> float:
@@ -119,6 +120,7 @@ class ProcessRobot:
         sent = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
         if sent.shape != (self.action_dim,) or not np.isfinite(sent).all():
             raise ValueError(f"ProcessRobot.send: action {action} is not {self.action_dim} finite numbers")
+        self._driven = True
         self._commands.put(sent.tobytes())
         self.child.nudge()
         return sent
@@ -126,6 +128,10 @@ class ProcessRobot:
     def brake(self) -> None:
         self._commands.put(BRAKE)
         self.child.nudge()
+
+    def stands(self) -> None:
+        """Take note that the robot was seen to stand: `close` may release it at once."""
+        self._driven = False
 
     def truth(self) -> Truth | None:
         """Of a simulated robot, at the frame that was read last; None of a real one."""
@@ -148,9 +154,10 @@ class ProcessRobot:
         return answer["result"]
 
     def close(self) -> None:
-        """Have the adapter brake the robot, release it, and end."""
+        """Have the adapter brake the robot, for a second where it may be rolling, release it, and end."""
         if self._descriptor >= 0:
-            self.child.nudge(END)
+            if not self._driven:
+                self.child.nudge(END)
             self.child.close(patience=5.0)
             self._calls.close()
             os.close(self._descriptor)

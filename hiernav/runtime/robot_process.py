@@ -32,13 +32,13 @@ from hiernav.runtime.wire import CAPACITY, encode_frame
 
 BRAKE = b"brake"
 END = b"e"
-"""News that this process is not needed any more."""
+"""News that this process is not needed any more, and that the robot stands."""
 STATUS = 64
 """Bytes at the front of the memory: what the watchdog has done."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0
-"""Time for which a robot is braked whose control process is gone, or which has failed, before it is released [s]."""
+"""Time for which a robot is braked that has failed, or of which nobody says that it stands, before it is released [s]."""
 
 
 def main() -> None:

@@ -141,6 +141,17 @@ def test_a_robot_that_does_not_stop_is_a_fault():
     assert robot.log[-1] == "brake"
 
 
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_robot_is_told_that_it_stands_where_that_was_seen(stops):
+    class Told(Puck):
+        def stands(self) -> None:
+            self.log.append("stands")
+
+    robot = Told(stops=stops, noise=1e-3)
+    assert driver_of(robot).run(GOAL).stopped == stops
+    assert robot.log.count("stands") == stops and (robot.log[-1] == "stands") == stops
+
+
 def test_a_robot_that_does_not_stop_while_it_serves_is_a_fault_of_that_goal():
     results: list[RunResult | None] = []
 

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import STATUS, Adapter, make_robot
+from hiernav.runtime.robot_process import LAST_BRAKES, STATUS, Adapter, make_robot
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_frame
 
 EXAMPLE = f"{ROOT / 'deploy' / 'example_robot.py'}:make"
@@ -66,6 +67,33 @@ def test_commands_reach_the_robot_and_frames_come_back(tmp_path):
         robot.close()
     done = [line.split()[0] for line in log.read_text().splitlines()]
     assert done[0] == "send" and done[-2:] == ["brake", "close"]
+
+
+def test_a_robot_is_released_at_once_where_it_stands_and_else_after_a_second_of_brakes(tmp_path):
+    def released(name: str, does: Callable[[ProcessRobot], object]) -> tuple[list[str], float]:
+        """What was done after the last command, and for how long [s]."""
+        log = tmp_path / name
+        robot = ProcessRobot(SCRIPTED, {"path": str(log)})
+        try:
+            robot.read()
+            does(robot)
+        finally:
+            robot.close()
+        assert robot.child.ended == 0
+        done = [line.split() for line in log.read_text().splitlines()]
+        last = max((k for k, (what, _) in enumerate(done) if what == "send"), default=-1)
+        return [what for what, _ in done[last + 1 :]], float(done[-1][1]) - float(done[last + 1][1])
+
+    def drive(robot: ProcessRobot) -> None:
+        while "send" not in (tmp_path / "driven").read_text():
+            robot.send(np.array([1.0, 0.0]))
+            time.sleep(0.001)
+        robot.brake()
+
+    done, seconds = released("driven", drive)
+    assert done[-1] == "close" and set(done[:-1]) == {"brake"} and seconds >= LAST_BRAKES
+    assert released("never", lambda robot: None)[0] == ["brake", "close"]
+    assert released("stands", lambda robot: (setattr(robot, "_driven", True), robot.stands()))[0] == ["brake", "close"]
 
 
 def test_a_robot_that_is_slow_at_first_is_waited_for(tmp_path):
