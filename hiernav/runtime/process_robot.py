@@ -17,8 +17,8 @@ import numpy as np
 from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import BRAKE, END, STATUS
-from hiernav.runtime.wire import CAPACITY, decode_frame
+from hiernav.runtime.robot_process import END, STATUS
+from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command
 
 
 def simulated(**arguments: Any) -> ProcessRobot:
@@ -121,12 +121,12 @@ class ProcessRobot:
         if sent.shape != (self.action_dim,) or not np.isfinite(sent).all():
             raise ValueError(f"ProcessRobot.send: action {action} is not {self.action_dim} finite numbers")
         self._driven = True
-        self._commands.put(sent.tobytes())
+        self._commands.put(encode_command(sent, time.monotonic()))
         self.child.nudge()
         return sent
 
     def brake(self) -> None:
-        self._commands.put(BRAKE)
+        self._commands.put(encode_command(None, time.monotonic()))
         self.child.nudge()
 
     def stands(self) -> None:

@@ -28,9 +28,8 @@ from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import Mailbox, mapped
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
-from hiernav.runtime.wire import CAPACITY, encode_frame
+from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 
-BRAKE = b"brake"
 END = b"e"
 """News that this process is not needed any more, and that the robot stands."""
 STATUS = 64
@@ -38,7 +37,7 @@ STATUS = 64
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0
-"""Time for which a robot is braked that has failed, or of which nobody says that it stands, before it is released [s]."""
+"""Time for which a robot is braked that failed, or of which nobody says that it stands, before it is released [s]."""
 
 
 def main() -> None:
@@ -169,13 +168,18 @@ class Adapter:
             time.sleep(self._period)
 
     def _obey(self, now: float) -> None:
-        command = self._commands.get()
-        if command is not None:
-            self.watchdog.feed(now)
-            if command == BRAKE:
+        """Follow a new command; brake if it was given too long ago, or if there is none and the last one is too old."""
+        message = self._commands.get()
+        if message is not None:
+            command, given = decode_command(message)
+            # this process may have been kept from looking, by the robot's driver or by the machine
+            fresh = now - given <= self.watchdog.timeout
+            if fresh:
+                self.watchdog.feed(min(given, now))
+            if command is None or not fresh:
                 self.robot.brake()
             else:
-                self.robot.send(np.frombuffer(command, np.float64))
+                self.robot.send(command)
         elif self.watchdog.expired(now):
             # once, then at the control rate: a bus may need the brake repeated, but not hundreds of times a second
             trips = self.watchdog.trips

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import msgspec
 import numpy as np
 
@@ -25,6 +27,7 @@ class _Frame(msgspec.Struct, array_like=True):
     truth: tuple[float, list[float], list[float], float, bool, int] | None
 
 
+_GIVEN = struct.Struct("<d")
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Frame)
 
@@ -80,6 +83,18 @@ def decode_frame(message: bytes) -> tuple[SensorFrame, Truth | None]:
         return frame, None
     time, pose, velocity, upright, collided, collisions = m.truth
     return frame, Truth(time, np.array(pose), np.array(velocity), upright, collided, collisions)
+
+
+def encode_command(action: np.ndarray | None, given: float) -> bytes:
+    """A command (A,), or the brake if None, that was given at `given` on the monotonic clock [s]."""
+    return _GIVEN.pack(given) + (b"" if action is None else np.asarray(action, np.float64).tobytes())
+
+
+def decode_command(message: bytes) -> tuple[np.ndarray | None, float]:
+    """Inverse of `encode_command`."""
+    (given,) = _GIVEN.unpack_from(message)
+    body = message[_GIVEN.size :]
+    return (np.frombuffer(body, np.float64) if body else None), given
 
 
 def _list(value: np.ndarray | None) -> list[float] | None:

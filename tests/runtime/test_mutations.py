@@ -52,6 +52,8 @@ MUTANTS = (
     Mutant("stop", WATCH, "if estimate is None or not math", "if False and not math", f"{T}/test_driver.py"),
     Mutant("adapter", f"{R}/robot.py", "if now - self._fed_at <= self.timeout:", "if True:",
            f"{F}/test_21_control_process_gone.py"),
+    Mutant("old command", f"{R}/robot_process.py", "fresh = now - given <= self.watchdog.timeout", "fresh = True",
+           f"{T}/test_process_robot.py::test_a_command_counts_from_when_it_was_given_and_an_old_one_is_not_followed"),
     Mutant("adapter that fails", f"{R}/robot_process.py", "failures += self._brake_for(last_brakes)", "pass",
            f"{F}/test_21_control_process_gone.py"),
     Mutant("signals to all", f"{R}/child.py", "signal.signal(number, signal.SIG_IGN)", "pass",

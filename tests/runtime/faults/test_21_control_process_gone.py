@@ -90,8 +90,7 @@ def test_an_adapter_whose_robot_fails_brakes_for_a_second_and_then_releases_it(t
     path = tmp_path / "robot.log"
     robot = ProcessRobot(f"{ROBOT}:make", {"path": str(path), "fails": fails, "good": good, "failures": failures})
     try:
-        robot.send(np.array([1.0, 0.0]))
-        _wait_for(lambda: "send" in path.read_text())
+        _wait_for(lambda: robot.send(np.array([1.0, 0.0])) is not None and "send" in path.read_text())
         while robot.child.ended is None:
             robot.brake() if fails == "brake" else robot.send(np.array([1.0, 0.0]))
             time.sleep(robot.control_period)
@@ -114,8 +113,7 @@ def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path
     try:
         robot.read()
         os.kill(robot.child.process.pid, number)
-        robot.send(np.array([1.0, 0.0]))
-        _wait_for(lambda: "send" in path.read_text())
+        _wait_for(lambda: robot.send(np.array([1.0, 0.0])) is not None and "send" in path.read_text())
     finally:
         robot.close()
     assert robot.child.ended == 0 and path.read_text().splitlines()[-1].startswith("close")
