@@ -495,23 +495,25 @@ class Driver:
             return
         self._end_trip("changed", now)
         self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
-        self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps), None
+        self._blind.renew(now)
         self._before = (self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts())
         self._no_way = BlockedWatch(0.0, self.config.no_way_at_start)
         self.guard.reset()
         self.pilot.reset()
         self._saturation.reset()
         self._saturated = 0
+        # last, and in `_end_trip` after the mode: a signal that comes between must not leave half of it
+        self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps), None
 
     def _end_trip(self, reason: str, now: float, detail: str = "") -> None:
         trip, supervisor = self._trip, self.supervisor
-        self._standing.begin(now)
-        if trip is None:
+        if trip is None:  # the robot was braked before
             return
+        self._standing.begin(now)
         trip.reason, trip.detail = reason, detail
-        self._trip, self._ended = None, trip
         if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
             supervisor.change(Mode.READY, reason, now)
+        self._trip, self._ended = None, trip
         self._emit("end", detail or reason, now, reason=reason, steps=trip.steps, seconds=trip.seconds)
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:
@@ -538,6 +540,7 @@ class Driver:
 
     def _estop(self, why: str, now: float) -> None:
         self.supervisor.stop(why, now)
+        self._standing.begin(now)
         self._end_trip("estop", now, why)
 
     def _acknowledge(self, now: float) -> None:

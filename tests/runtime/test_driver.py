@@ -249,6 +249,53 @@ def test_a_robot_waits_for_its_first_fix_and_then_goes():
     assert result.reached and result.steps == 14
 
 
+def without_fix_before(stamp: float) -> Callable[[SensorFrame], SensorFrame]:
+    return lambda frame: frame if frame.stamp >= stamp else replace(frame, position_fix=None)
+
+
+def test_a_first_fix_may_take_longer_than_a_stop():
+    config = DriverConfig(first_estimate=10.0, stop_timeout=1.0)
+    result = driver_of(Puck(sees=without_fix_before(6.0)), config=config).run(GOAL)
+    assert result.reached and result.fault is None
+
+
+def test_a_service_gives_the_first_fix_its_time_from_the_goal_on():
+    modes: list[Mode] = []
+
+    class Watcher(Observer):
+        def tick(self, record: TickRecord) -> None:
+            modes.append(record.mode)
+            if record.index == 40:
+                driver.cancel()
+            elif record.index == 50:
+                driver.set_goal(GOAL)
+            elif driver.last_result is not None or record.index == 200:
+                driver.quit()
+
+    robot = Puck(sees=without_fix_before(6.5), noise=1e-3)
+    driver = driver_of(robot, observers=[Watcher()])
+    driver.serve()
+    assert driver.last_result is not None and driver.last_result.reached and Mode.FAULT not in modes
+    robot.sees = without_fix_before(7.5 + robot.stamp)
+    driver.serve()
+    assert driver.supervisor.mode is Mode.FAULT and driver.supervisor.fault == "no position and heading for 2.10 s"
+
+
+@pytest.mark.parametrize("reason", ["goal", "cancelled"])
+def test_a_signal_between_the_end_of_a_trip_and_its_change_of_mode_leaves_them_agreed(reason):
+    driver = driver_of(pilot=Scripted(lambda step, straight: driver.cancel() or straight) if reason != "goal" else None)
+    change = driver.supervisor.change
+
+    def change_late(mode: Mode, why: str, now: float) -> None:
+        if why == reason:
+            signal.raise_signal(signal.SIGINT)
+        change(mode, why, now)
+
+    driver.supervisor.change = change_late  # type: ignore[method-assign]
+    result = driver.run(GOAL)
+    assert (result.reason, result.stopped) == ("interrupted", True) and driver.supervisor.mode is Mode.INIT
+
+
 def test_sensors_that_repeat_themselves_are_not_driven_on_for_long():
     robot = Puck(sees=frozen_after(0.35))
     result = driver_of(robot, Scripted(lambda step, straight: np.array([0.1, 0.0]))).run(GOAL)
