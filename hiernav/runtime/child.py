@@ -10,6 +10,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from hiernav.runtime.loop import STOP_SIGNALS
+
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -69,8 +71,8 @@ class Child:
 
 
 def leave_signals_to_parent() -> None:
-    """In the child: SIGINT and SIGTERM, which may be sent to all processes at once, are for the parent to act upon."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """In the child: `STOP_SIGNALS`, which may be sent to all processes at once, are for the parent to act upon."""
+    for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 

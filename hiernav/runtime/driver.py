@@ -135,7 +135,7 @@ class Driver:
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake, prepare=prepare, lead=rehearsal)
         self._rehearsal: Rehearsal | None = None
         self.interrupted = False
-        """Whether SIGINT or SIGTERM arrived during the last run, be it while the robot was stopping at its goal."""
+        """Whether SIGINT, SIGTERM or SIGHUP arrived in the last run, be it while the robot was stopping at its goal."""
         self.gone: str | None = None
         """Why the last run ended without anybody's wish: the robot cannot be read any more (`RobotGone`)."""
         self.last_result: RunResult | None = None
@@ -167,7 +167,7 @@ class Driver:
         return self.last_result
 
     def serve(self) -> None:
-        """Stay ready for goals (`set_goal`), until `quit`, SIGINT or SIGTERM, or until the robot is `gone`.
+        """Stay ready for goals (`set_goal`), until `quit`, SIGINT, SIGTERM or SIGHUP, or until the robot is `gone`.
 
         Other faults are waited out, not raised.
         """

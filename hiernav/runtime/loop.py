@@ -14,6 +14,8 @@ from hiernav.runtime.clock import Clock
 from hiernav.runtime.timing import Histogram
 
 BRAKE_ATTEMPTS = 3
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What asks for an end. A SIGHUP that is ignored, as under nohup, asks for none."""
 
 
 class LoopExit(Enum):
@@ -24,7 +26,7 @@ class LoopExit(Enum):
 
 
 class Interrupted(KeyboardInterrupt):
-    """SIGINT or SIGTERM arrived while the loop ran."""
+    """One of `STOP_SIGNALS` arrived while the loop ran."""
 
 
 class FixedRateLoop:
@@ -32,7 +34,7 @@ class FixedRateLoop:
 
     A deadline that has passed when the previous tick ends is skipped and counted, never caught up in a burst, and
     the deadlines after it stay where they were. `brake` is called once the loop is left, whether by return,
-    exception, KeyboardInterrupt or SIGTERM, and again (three times at most) if it raises.
+    exception, KeyboardInterrupt or signal (`STOP_SIGNALS`), and again (three times at most) if it raises.
     """
 
     def __init__(
@@ -51,7 +53,7 @@ class FixedRateLoop:
             period: [s].
             tick: called with the time [s]; returns True when the loop is done.
             brake: stops the robot.
-            handle_signals: turn SIGINT and SIGTERM into an interruption while the loop runs in the main thread.
+            handle_signals: turn `STOP_SIGNALS` into an interruption while the loop runs in the main thread.
             prepare: called just early enough before a deadline to be done by then, where there is time; with False, and
                 then, if there is time for that as well, with True.
             lead: time before the deadline at which it is begun at most [s].
@@ -189,7 +191,7 @@ class FixedRateLoop:
 
 @contextmanager
 def noting_signals(note: Callable[[], None]) -> Iterator[None]:
-    """Have SIGINT and SIGTERM call `note` and nothing else, where this is the main thread.
+    """Have `STOP_SIGNALS` call `note` and nothing else, where this is the main thread.
 
     For what must be brought to its end around a loop: between its last tick and the program's end nothing is to be
     cut short. A loop that runs inside handles signals in its own way.
@@ -201,9 +203,15 @@ def noting_signals(note: Callable[[], None]) -> Iterator[None]:
         yield
 
 
+def stop_signals() -> tuple[signal.Signals, ...]:
+    """Those of `STOP_SIGNALS` that are to be obeyed by this process."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return tuple(number for number in STOP_SIGNALS if number is not signal.SIGHUP or not ignored)
+
+
 @contextmanager
 def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handler) for number in stop_signals()}
     try:
         yield
     finally:

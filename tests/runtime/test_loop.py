@@ -140,7 +140,7 @@ def test_a_keyboard_interrupt_brakes_and_returns():
     assert brakes.calls == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_brakes_and_returns(number):
     brakes = Brakes()
     before = signal.getsignal(number)
@@ -152,6 +152,21 @@ def test_a_signal_brakes_and_returns(number):
     assert FixedRateLoop(FakeClock(), PERIOD, tick, brakes).run() is LoopExit.INTERRUPTED
     assert brakes.calls == 1
     assert signal.getsignal(number) is before
+
+
+def test_a_hangup_that_is_ignored_as_under_nohup_stays_ignored():
+    ticks: list[float] = []
+
+    def tick(now: float) -> bool:
+        signal.raise_signal(signal.SIGHUP)
+        ticks.append(now)
+        return len(ticks) == 3
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert FixedRateLoop(FakeClock(), PERIOD, tick, Brakes()).run() is LoopExit.DONE
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_signal_that_code_of_a_tick_swallows_ends_the_loop_after_that_tick():
