@@ -3,7 +3,8 @@
 
 The robot is a simulated one with noisy sensors, or yours (--adapter); the policies see the estimate alone. In real time
 the planner and the robot's adapter live in processes of their own. Every drive in simulation leaves a picture, the run
-a summary on screen and as JSON. Ctrl-C brakes the robot, verifies that it stands, and still writes the summary.
+a summary on screen and as JSON. Ctrl-C, SIGTERM and SIGHUP brake the robot, have it verified that it stands, and still
+write the summary.
 
   run_loop.py --episodes 10                       ten simulated worlds
   run_loop.py --serve                             be ready for goals, until Ctrl-C
@@ -33,7 +34,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -49,7 +50,7 @@ from hiernav.runtime.dry_run import print_report, report
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.faulty import FAULTS, FaultyRobot
 from hiernav.runtime.guard import Guard
-from hiernav.runtime.loop import noting_signals
+from hiernav.runtime.loop import noting_signals, stop_signals
 from hiernav.runtime.noise import EXACT
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
@@ -57,7 +58,7 @@ from hiernav.runtime.policy import make_agent, require_fit
 from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.robot import Robot
+from hiernav.runtime.robot import Robot, Truth
 from hiernav.runtime.settings import Settings, load_settings
 from hiernav.runtime.summary import Episode, print_summary, summarise
 from hiernav.runtime.trip import RunResult
@@ -112,19 +113,20 @@ class Drive(Observer):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(_join_goal(sys.argv[1:] if argv is None else argv))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # until the loop runs, SIGTERM is a Ctrl-C
+    for number in stop_signals():
+        signal.signal(number, signal.default_int_handler)  # until the loop runs, each of them is a Ctrl-C
     try:
         if arguments.tell is not None:
             return _tell(arguments)
         return _dry_run(arguments) if arguments.dry_run else _run(arguments)
     except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
-        print("run_loop: interrupted", file=sys.stderr)
+        _complain("interrupted")
         return OK
     except BundleError as error:
-        print(f"run_loop: bundle refused: {error}", file=sys.stderr)
+        _complain(f"bundle refused: {error}")
         return BAD_BUNDLE
     except (ValueError, OSError, RuntimeError) as error:
-        print(f"run_loop: {' '.join(str(error).split())}", file=sys.stderr)
+        _complain(" ".join(str(error).split()))
         return BAD_GOAL if isinstance(error, GoalError) else BAD_INPUT
 
 
@@ -250,7 +252,10 @@ def _run(arguments: argparse.Namespace) -> int:
             link = ProcessPlanner(bundle, driver.robot_radius, pixels, goal_radius=driver.goal_radius)
             stack.callback(link.close)
         episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
-        return episodes.serve() if arguments.serve or view else episodes.drive()
+        code = episodes.serve() if arguments.serve or view else episodes.drive()
+        with noting_signals(lambda: None):
+            stack.close()
+        return code
 
 
 class Episodes:
@@ -268,6 +273,7 @@ class Episodes:
     ) -> None:
         self.arguments, self.layouts, self.remote, self.link = arguments, layouts, remote, link
         self.layout = layouts[0]
+        self.interrupted = self.failed = False
         clock: Clock
         robot: Robot
         if remote is not None:
@@ -308,47 +314,77 @@ class Episodes:
 
     def drive(self) -> int:
         """From start to goal in every world."""
-        episodes: list[Episode] = []
-        drives: list[Drive] = []
-        for layout in self.layouts:
-            self.layout = layout
-            if not self.arguments.adapter:
-                self._reset(layout)
-                if self.driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people
-                    self.driver.supervisor.acknowledge(self.driver.clock.now())
-            drives.append(Drive())
-            self._watch(drives[-1])
-            episodes.append(self._episode(layout, self.driver.run(layout.goal), drives[-1]))
-            if self.driver.interrupted or self.driver.supervisor.latched and self.arguments.adapter:
-                break
-        return self._finish(episodes, drives)
+        return self._account_for(self._drive)
 
     def serve(self) -> int:
         """Ready for goals until interrupted, or until the robot's adapter has ended, which is a fault."""
-        drive = Drive()
-        self._watch(drive)
+        return self._account_for(self._serve)
+
+    def _drive(self, episodes: list[Episode], drives: list[Drive]) -> None:
+        for layout in self.layouts:
+            self.layout = layout
+            drives.append(Drive())
+            self._watch(drives[-1])
+            if not self.arguments.adapter:
+                try:
+                    self._reset(layout)
+                except RuntimeError as error:  # a world that is not entered costs nothing of those that were driven
+                    self.failed = True
+                    _complain(" ".join(str(error).split()))
+                    break
+                if self.driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people
+                    self.driver.supervisor.acknowledge(self.driver.clock.now())
+            if self.interrupted:
+                break
+            episodes.append(self._episode(layout, self.driver.run(layout.goal), drives[-1]))
+            if self.driver.interrupted or self.driver.gone or self.driver.supervisor.latched and self.arguments.adapter:
+                break
+
+    def _serve(self, episodes: list[Episode], drives: list[Drive]) -> None:
+        drives.append(Drive())
+        self._watch(drives[-1])
         if self.page is not None and not (self.arguments.serve or self.arguments.adapter):
             self.page.first_goal = self.layout.goal
         path = self.arguments.control or default_socket()
         with ControlServer(self.driver, path):
-            self.console.print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})", highlight=False)
+            self._print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})")
             self.driver.serve()
-        result = self.driver.last_result
-        code = self._finish([] if result is None else [self._episode(self.layout, result, drive)], [drive])
-        return code if self.driver.gone is None else FAULT
+        if self.driver.last_result is not None:
+            episodes.append(self._episode(self.layout, self.driver.last_result, drives[-1]))
+
+    def _account_for(self, go: Callable[[list[Episode], list[Drive]], None]) -> int:
+        """Drive, and show and save the account of it, wherever a signal arrives; pictures alone can be spared."""
+        episodes: list[Episode] = []
+        drives: list[Drive] = []
+        code = OK
+        try:
+            with noting_signals(self._interrupt):
+                go(episodes, drives)
+                code = self._finish(episodes, drives)
+            if not (self.arguments.no_pictures or self.interrupted):
+                self._draw(episodes, drives)
+        except KeyboardInterrupt:
+            _complain("interrupted, pictures are missing")
+        return code
+
+    def _interrupt(self) -> None:
+        self.interrupted = True
+        self.driver.quit()
 
     def _watch(self, drive: Drive) -> None:
         self.driver.audience.observers = [drive, *filter(None, [self.recorder, self.page])]
 
     def _episode(self, layout: Layout, result: RunResult, drive: Drive) -> Episode:
-        truth = self.driver.truth()
+        truth: Truth | None = None
+        with suppress(RuntimeError):  # the robot may be gone
+            truth = self.driver.truth()
         collisions, distance = None, None
         if truth is not None:
             collisions, distance = truth.collisions, float(np.linalg.norm(truth.pose[:2] - layout.goal))
         text = f"seed {layout.seed}: {result.reason} after {result.steps} steps ({result.seconds:.1f} s)"
         if collisions is not None:
             text += f", {collisions} collisions"
-        self.console.print(f"{text}{': ' + result.detail if result.detail else ''}", highlight=False)
+        self._print(f"{text}{': ' + result.detail if result.detail else ''}")
         return Episode(layout.seed, result, collisions, distance)
 
     def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
@@ -356,27 +392,23 @@ class Episodes:
         code = OK
         if any(episode.result.refused for episode in episodes):
             code = BAD_GOAL
-        if any(episode.result.fault for episode in episodes):
+        if self.failed or self.driver.gone or any(episode.result.fault for episode in episodes):
             code = FAULT
-        interrupted: list[bool] = []
-        with noting_signals(lambda: interrupted.append(True)):  # pictures can be spared, the account cannot
-            for observer in filter(None, (self.recorder, self.page)):
-                observer.close()
-            summary = self._summary(episodes, drives)
-            print_summary(summary, self.console)
-            if self.recorder is not None:
-                self.console.print(f"recording: {self.recorder}", highlight=False)
-            self.console.print(f"run folder: {self.out}", highlight=False)
-            if self.arguments.json == "-":
-                print(json.dumps(summary, indent=2), flush=True)
-            for file in self.files:
-                _save(file, summary)
-        try:
-            if not (self.arguments.no_pictures or interrupted):
-                self._draw(episodes, drives)
-        except KeyboardInterrupt:
-            print("run_loop: interrupted, pictures are missing", file=sys.stderr)
+        for observer in filter(None, (self.recorder, self.page)):
+            observer.close()
+        summary = self._summary(episodes, drives)
+        _show(lambda: print_summary(summary, self.console), self.console.file)
+        if self.recorder is not None:
+            self._print(f"recording: {self.recorder}")
+        self._print(f"run folder: {self.out}")
+        if self.arguments.json == "-":
+            _show(lambda: print(json.dumps(summary, indent=2), flush=True), sys.stdout)
+        for file in self.files:
+            _save(file, summary)
         return code
+
+    def _print(self, text: str) -> None:
+        _show(lambda: self.console.print(text, highlight=False), self.console.file)
 
     def _summary(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> dict[str, Any]:
         summary = summarise(episodes, self.driver.timer, self.driver.loop, self.granted)
@@ -409,6 +441,19 @@ def _screen(arguments: argparse.Namespace) -> Console:
     return Console(stderr=arguments.json == "-")
 
 
+def _show(show: Callable[[], object], stream: IO[str]) -> None:
+    """Show something on `stream`. A terminal or a pipe that is closed must not cost what comes after it."""
+    try:
+        show()
+    except (OSError, SystemExit):  # the latter is what rich makes of a broken pipe
+        with suppress(OSError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), stream.fileno())  # for what is still in its buffer
+
+
+def _complain(text: str) -> None:
+    _show(lambda: print(f"run_loop: {text}", file=sys.stderr, flush=True), sys.stderr)
+
+
 def _require_writable(file: Path, option: str) -> None:
     """Make the folder of a file that is to be written later, and see that it can be written to.
 
@@ -436,7 +481,7 @@ def _save(file: Path, values: Any) -> None:
 
 
 def _warn(file: Path, error: OSError) -> None:
-    print(f"run_loop: {file} is not written: {error.strerror or error}", file=sys.stderr)
+    _complain(f"{file} is not written: {error.strerror or error}")
 
 
 def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:

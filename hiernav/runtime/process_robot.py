@@ -143,10 +143,12 @@ class ProcessRobot:
         """Call a method of the robot over there, and wait for it. Not for use while it is driven.
 
         Raises:
+            RobotGone: the adapter has ended.
             RuntimeError: the method raised, or the adapter does not answer.
         """
         self._wait_for_start()
-        self._calls.sendall(json.dumps({"method": method, "arguments": arguments}).encode() + b"\n")
+        with suppress(ConnectionError):  # that the adapter has ended shows where its answer is waited for
+            self._calls.sendall(json.dumps({"method": method, "arguments": arguments}).encode() + b"\n")
         answer = self._receive()
         if "error" in answer:
             raise RuntimeError(answer["error"])

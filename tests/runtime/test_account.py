@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from run_loop_script import load_script
+from shipped import RUN_LOOP
+
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.robot import RobotGone
+from hiernav.runtime.sim_robot import SimRobot
 
 script = load_script()
 SHORT = ["--fast", "--world", "pillar(2,2,0)", "--set", "driver.max_steps=3"]
@@ -74,6 +83,70 @@ def test_ctrl_c_while_pictures_are_drawn_costs_pictures_alone(run, tmp_path, cap
     assert run(*FAULTY) == script.FAULT
     assert "0 of 1 goals reached" in capsys.readouterr().out
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["summary.json"]
+
+
+def driven(folder: Path) -> list[str]:
+    return [episode["reason"] for episode in json.loads((folder / "out/summary.json").read_text())["episodes"]]
+
+
+def test_a_signal_between_two_worlds_costs_nothing_of_what_was_driven(run, tmp_path, monkeypatch):
+    episode = script.Episodes._episode
+    monkeypatch.setattr(
+        script.Episodes, "_episode", lambda *given: signal.raise_signal(signal.SIGTERM) or episode(*given)
+    )
+    assert run(*SHORT, "--episodes", "3") == 0
+    assert driven(tmp_path) == ["timeout"]
+
+
+def test_a_signal_just_before_a_world_is_driven_keeps_the_robot_from_moving(run, tmp_path, monkeypatch):
+    begin, begun = Driver._begin, []
+
+    def begin_late(driver: Driver) -> None:
+        begin(driver)
+        begun.append(driver)
+        if len(begun) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Driver, "_begin", begin_late)
+    assert run(*SHORT, "--episodes", "3") == 0
+    assert driven(tmp_path) == ["timeout", "interrupted"] and begun[0].loop.ticks == 4
+
+
+def test_a_world_that_cannot_be_entered_is_a_fault_and_costs_nothing_of_what_was_driven(
+    run, tmp_path, capsys, monkeypatch
+):
+    reset, begun = SimRobot.reset, []
+
+    def gone(robot: SimRobot, layout: object, seed: int) -> None:
+        begun.append(seed)
+        if seed == 2:
+            raise RobotGone("the robot's adapter ended with status -9")
+        reset(robot, layout, seed)
+
+    monkeypatch.setattr(SimRobot, "reset", gone)
+    assert run(*SHORT, "--episodes", "5", "--no-pictures") == script.FAULT
+    assert driven(tmp_path) == ["timeout", "timeout"] and begun[-1] == 2
+    assert capsys.readouterr().err == "run_loop: the robot's adapter ended with status -9\n"
+
+
+def test_a_screen_that_nobody_reads_costs_neither_worlds_nor_account_nor_exit_code(tmp_path):
+    reads, writes = os.pipe()
+    os.close(reads)
+    command = [
+        sys.executable,
+        str(RUN_LOOP),
+        *SHORT,
+        "--episodes",
+        "2",
+        "--no-pictures",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    try:
+        assert subprocess.run(command, stdout=writes, stderr=writes, timeout=60).returncode == 0
+    finally:
+        os.close(writes)
+    assert driven(tmp_path) == ["timeout", "timeout"]
 
 
 @pytest.mark.parametrize("dry", [False, True])

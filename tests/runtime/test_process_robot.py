@@ -219,9 +219,11 @@ def test_an_adapter_that_ends_is_an_error_at_the_next_read(tmp_path):
     robot.child.process.kill()
     robot.child.process.wait()
     robot.brake()
-    with pytest.raises(RuntimeError, match="adapter ended with status -9"):
+    with pytest.raises(RobotGone, match="adapter ended with status -9"):
         for _ in range(3):
             robot.read()
+    with pytest.raises(RobotGone, match="adapter ended with status -9"):
+        robot.call("restart", seed=1)
     robot.close()
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
 import subprocess
 import sys
+import termios
 import textwrap
 import time
 from pathlib import Path
@@ -14,6 +16,15 @@ from pathlib import Path
 import pytest
 from scripted_robot import write_adapter
 from shipped import RUN_LOOP
+
+
+@pytest.fixture(autouse=True)
+def hangups_are_obeyed():
+    """Also where the tests run under nohup, which what they start would inherit."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
 
 PROGRAM = textwrap.dedent(
     """
@@ -68,7 +79,7 @@ def test_a_signal_brakes_and_saves_before_anything_else(signals):
     assert lines[-1].split()[2] == "True"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
     out = tmp_path / "out"
     command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
@@ -85,7 +96,7 @@ def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
     assert json.loads((out / "summary.json").read_text())["timing"]["ticks"] > 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_to_all_processes_ends_them_in_order_and_the_robot_is_braked_and_released(tmp_path, number):
     log, adapter = tmp_path / "log", write_adapter(tmp_path / "log", tmp_path / "adapter.py")
     command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
@@ -109,6 +120,25 @@ def test_a_signal_to_all_processes_ends_them_in_order_and_the_robot_is_braked_an
     done = [line.split()[0] for line in log.read_text().splitlines()]
     assert set(done[:-1]) == {"brake"} and done[-1] == "close"
     assert not any(os.path.exists(f"/proc/{pid}") for pid in family)
+
+
+def test_a_terminal_that_is_closed_ends_the_command_line_as_well_and_costs_no_summary(tmp_path):
+    """Nothing can be shown any more: every write to it fails."""
+    ours, theirs = os.openpty()
+    out = tmp_path / "out"
+    command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
+    process = subprocess.Popen(
+        [*command, "--planner", "sync", "--out", str(out)],
+        stdin=theirs, stdout=theirs, stderr=theirs,
+        start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    while b"ready for goals" not in shown:
+        shown += os.read(ours, 4096)
+    os.close(ours)
+    assert process.wait(60) == 0
+    assert json.loads((out / "summary.json").read_text())["episodes"] == []
 
 
 def descendants(pid: int) -> list[int]:

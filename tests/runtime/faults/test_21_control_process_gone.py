@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -106,7 +107,7 @@ def test_an_adapter_whose_robot_fails_brakes_for_a_second_and_then_releases_it(t
     assert f"OSError: {fails}: bus error" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_to_the_adapter_alone_leaves_it_to_its_control_process(tmp_path, number):
     path = tmp_path / "robot.log"
     robot = ProcessRobot(f"{ROBOT}:make", {"path": str(path)})
@@ -138,6 +139,23 @@ def test_a_service_whose_adapter_dies_ends_with_code_1_so_that_it_is_started_aga
     assert "RobotGone: the robot's adapter ended with status -9" in errors
     assert errors.count("Traceback") <= 2, "of the tick, and of the stop that could not be verified"
     assert (out / "summary.json").exists()
+
+
+def test_a_run_of_several_worlds_whose_adapter_dies_ends_with_code_1_and_the_account_of_what_was_driven(tmp_path):
+    command = [sys.executable, "-u", str(RUN_LOOP), "--episodes", "500", "--world", "pillar(2,2,0)", "--no-pictures"]
+    process = subprocess.Popen(
+        [*command, "--planner", "sync", "--out", str(tmp_path / "out")],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None and process.stdout.readline().startswith("seed 0: goal")
+        (child,) = descendants(process.pid)
+        os.kill(child, signal.SIGKILL)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 1 and "adapter ended with status -9" in errors
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["episodes"][0]["reached"]
 
 
 @pytest.mark.parametrize("fails", ["brake", "close"])
