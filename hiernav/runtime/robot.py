@@ -121,7 +121,7 @@ class CommandWatchdog:
         self._tripped = False
 
     def feed(self, now: float) -> None:
-        """A command arrived at `now` [s]."""
+        """A command that was given at `now` [s] is followed."""
         self._fed_at = now
         self._tripped = False
 
