@@ -297,6 +297,7 @@ class Driver:
             truth = self._truth() if self._truth is not None and self.audience else None
             timer.mark("read")
             self._estimate = estimate = self.estimator.update(frame)
+            terms = self._terms.fill(frame)
             timer.mark("estimate")
         except Exception:
             self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
@@ -315,7 +316,7 @@ class Driver:
             occupancy = self._occupancy = self.occupancy(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
-                decision = self._decide(self._trip, frame, estimate, occupancy, now)
+                decision = self._decide(self._trip, terms, estimate, occupancy, now)
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
@@ -374,11 +375,11 @@ class Driver:
         return self._trip is None
 
     def _decide(
-        self, trip: Trip, frame: SensorFrame, estimate: Estimate, occupancy: OccupancyMap, now: float
+        self, trip: Trip, terms: dict[str, np.ndarray], estimate: Estimate, occupancy: OccupancyMap, now: float
     ) -> Decision:
         if not self.supervisor.driving:
             self.pilot.rest()
-        decision = self.pilot.act(now, estimate, self._terms.fill(frame), trip.goal, occupancy)
+        decision = self.pilot.act(now, estimate, terms, trip.goal, occupancy)
         if decision.reason is not TerminationReason.NONE:
             trip.replans[decision.reason.name.lower()] += 1
             self.timer.mark_split("infer", "plan", decision.plan_seconds)
