@@ -12,13 +12,12 @@ import numpy as np
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
-from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
+from hiernav.runtime.robot import ABSURD, VECTOR_SENSORS, SensorFrame
+from hiernav.runtime.terms import is_sound
 from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
 __all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
 
-ABSURD = 1e6
-"""No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
 JUMP_AFTER, RESTART_AFTER = 2, 10
@@ -81,6 +80,7 @@ class Estimator:
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
+        self._heard: dict[str, float] = {}
 
     @property
     def ready(self) -> bool:
@@ -89,6 +89,8 @@ class Estimator:
 
     def silence(self, sensor: str) -> float:
         """For how long a sensor, such as "velocimeter", has said nothing new [s]; 0 for one never heard of."""
+        if sensor in self._heard:
+            return self._stamp - self._heard[sensor]
         return self._watch.silence(sensor, self._stamp)
 
     def update(self, frame: SensorFrame) -> Estimate | None:
@@ -102,6 +104,7 @@ class Estimator:
             The state at the newest stamp; None until position and heading are known.
         """
         if self._accept_stamp(float(frame.stamp)):
+            self._listen(frame)
             readings = {name: self._read(name, getattr(frame, name)) for name in VECTOR_SENSORS}
             field = self._trusted_field(readings["magnetometer"])
             turn = self._turn(frame.rotation)
@@ -112,6 +115,15 @@ class Estimator:
             self._remember()
             self._correct_position(frame)
         return self._estimate() if self.ready else None
+
+    def _listen(self, frame: SensorFrame) -> None:
+        """Note which of the sensors that only the skill needs say something that it can use: lidar and robot's own."""
+        heard, stamp = self._heard, self._stamp
+        if frame.lidar is not None and (is_sound("lidar", frame.lidar) or "lidar" not in heard):
+            heard["lidar"] = stamp
+        for name, value in frame.extra.items():
+            if is_sound(name, value) or name not in heard:
+                heard[name] = stamp
 
     def _read(self, name: str, value: np.ndarray | None) -> Vector | None:
         """A sensor's reading, unless it is missing, garbage, or frozen for too long to be believed."""
@@ -132,10 +144,11 @@ class Estimator:
                 self.counts["stale_frame"] += 1
                 return False
             self.counts["gap" if step > 0.0 else "clock_restart"] += 1
-            sensors, first = self._watch.sensors, True
+            sensors, terms, first = self._watch.sensors, self._heard, True
             self.reset()
             for name in sensors:
                 self._watch.expect(name, stamp)
+            self._heard = dict.fromkeys(terms, stamp)
         self._step = 0.0 if first else step
         self._stamp, self._odd = stamp, 0
         return True
@@ -333,6 +346,13 @@ class Estimator:
             trust = Trust.LOST if silence >= lost else Trust.HOLD
             if trust > worst:
                 worst, why = trust, f"{name} says nothing new for {silence:.2f} s"
+        for name, heard in self._heard.items():
+            silence = self._stamp - heard
+            if silence < self.config.hold_after:
+                continue
+            trust = Trust.LOST if silence >= self.config.lost_after else Trust.HOLD
+            if trust > worst:
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s"
         return worst, why
 
     def _estimate(self) -> Estimate:
