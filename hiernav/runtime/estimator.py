@@ -88,7 +88,7 @@ class Estimator:
         return self._has_position and self._has_yaw
 
     def silence(self, sensor: str) -> float:
-        """For how long a sensor, such as "velocimeter", has said nothing new [s]; 0 for one never heard of."""
+        """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
         if sensor in self._heard:
             return self._stamp - self._heard[sensor]
         return self._watch.silence(sensor, self._stamp)
@@ -131,9 +131,13 @@ class Estimator:
         if reading is None and value is not None:
             self._watch.expect(name, self._stamp)
         self._watch.see(name, reading, self._stamp)
-        if reading is not None and self._watch.silence(name, self._stamp) >= self.config.hold_after:
+        if reading is None:
+            return None
+        if self._watch.repetition(name, self._stamp) >= self.config.hold_after:
             self.counts[f"{name}_frozen"] += 1
             return None
+        if name == "accelerometer":  # what it says is weighed, never rejected
+            self._watch.believe(name, self._stamp)
         return reading
 
     def _accept_stamp(self, stamp: float) -> bool:
@@ -187,6 +191,7 @@ class Estimator:
             integrated = (turn[0] / dt, turn[1] / dt, turn[2] / dt)
             if math.dist(integrated, gyro) <= 2.0 * config.max_jump:
                 mean, change, accuracy = integrated, 0.0, _INTEGRATED
+                self._watch.believe("gyro", self._stamp)  # legs hammer: not every leap is a spike
             else:
                 self.counts["rotation_rejected"] += 1
         if config.tilts:
@@ -205,13 +210,16 @@ class Estimator:
 
     def _measured_rate(self, rate: Vector | None) -> tuple[Vector, float]:
         """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
-        if rate is None or max(map(abs, rate)) > MAX_RATE:
+        if rate is None:
+            return self._rate, 1.0
+        if max(map(abs, rate)) > MAX_RATE:
+            self.counts["gyro_rejected"] += 1
             return self._rate, 1.0
         jump = math.dist(rate, self._rate)
         # One reading far off is a spike; three in a row are the truth.
         if jump > self.config.max_jump and not self._reject("gyro", rate, self.config.max_jump):
             return self._rate, 1.0
-        self._accept("gyro")
+        self._accept("gyro", self._stamp)
         # What a jump adds to the angle is as uncertain as it is large.
         return rate, jump
 
@@ -241,7 +249,7 @@ class Estimator:
             if not self._reject("magnetometer", (miss,)):
                 return
             self._filter.replace((YAW,), (wrap(yaw),), variance)
-        self._accept("magnetometer")
+        self._accept("magnetometer", self._stamp)
 
     def _correct_velocity(self, velocity: Vector | None, forward: Vector, left: Vector) -> None:
         if velocity is None:
@@ -255,7 +263,7 @@ class Estimator:
             if not self._reject("velocimeter", miss):
                 return
             self._filter.replace(VELOCITY, (ahead, aside), variance)
-        self._accept("velocimeter")
+        self._accept("velocimeter", self._stamp)
 
     def _remember(self) -> None:
         x, y = self._filter.x[:2]
@@ -279,7 +287,7 @@ class Estimator:
             return
         self._fix_stamp = stamp
         self._watch.see("position_fix", tuple(fix), stamp)
-        if self._watch.silence("position_fix", stamp) >= self.config.hold_after:
+        if self._watch.repetition("position_fix", stamp) >= self.config.hold_after:
             self.counts["position_fix_frozen"] += 1
             return
         then = self._position_at(stamp)
@@ -294,7 +302,7 @@ class Estimator:
             self._has_position = True
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)
-        self._accept("position_fix")
+        self._accept("position_fix", stamp)
 
     def _position_at(self, stamp: float) -> tuple[float, float]:
         """Where the filter has the robot at `stamp`, which lies within the history [m]."""
@@ -314,8 +322,10 @@ class Estimator:
             entry[1] += dx
             entry[2] += dy
 
-    def _accept(self, sensor: str) -> None:
+    def _accept(self, sensor: str, stamp: float) -> None:
+        """A measurement taken at `stamp` [s] was used."""
         self._rejected[sensor] = 0
+        self._watch.believe(sensor, stamp)
 
     def _reject(self, sensor: str, miss: tuple[float, ...], spread: float | None = None) -> bool:
         """Count a rejected measurement.
@@ -345,7 +355,7 @@ class Estimator:
                 continue
             trust = Trust.LOST if silence >= lost else Trust.HOLD
             if trust > worst:
-                worst, why = trust, f"{name} says nothing new for {silence:.2f} s"
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s"
         for name, heard in self._heard.items():
             silence = self._stamp - heard
             if silence < self.config.hold_after:

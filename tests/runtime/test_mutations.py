@@ -42,6 +42,8 @@ MUTANTS = (
     Mutant("plan from before", f"{R}/estimator.py", "self._starts += 1", "self._starts = 1", f"{F}/test_06_stamps.py"),
     Mutant("gate of positions", f"{R}/planar_filter.py", "if not 0.0 <= distance <= gate:", "if False:",
            f"{F}/test_04_spikes.py"),
+    Mutant("nothing but lies", f"{R}/freshness.py", "if self.frozen(name) else sensor.believed)",
+           "if self.frozen(name) else stamp)", f"{F}/test_04_spikes.py"),
     Mutant("overruns", WATCH, "if overruns_in_a_row >= self.limit:", "if False:", f"{F}/test_22_overload.py"),
     Mutant("overdue plan, slow", WATCH, "if overdue <= self.slow_after:", "if overdue <= self.hold_after:",
            f"{F}/test_09_planner_hangs.py::test_the_old_plan_is_followed_then_slowly_and_then_the_robot_holds"),

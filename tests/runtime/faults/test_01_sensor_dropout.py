@@ -34,7 +34,8 @@ def test_a_dropout_is_predicted_through_then_held_then_lost(sensors, seconds, wo
     assert while_silent[0].trust is Trust.GOOD
     if worst is not Trust.GOOD:
         assert any(each.why.startswith(sensors) for each in while_silent)
-    assert all(each.trust is Trust.GOOD for each in errors.estimates if each.stamp > BEGIN + seconds + 0.05)
+    # a turn that nobody measured shows in the first heading: it is believed with the tenth
+    assert all(each.trust is Trust.GOOD for each in errors.estimates if each.stamp > BEGIN + seconds + 0.19)
     assert np.isfinite([each.pose for each in errors.estimates]).all()
 
 

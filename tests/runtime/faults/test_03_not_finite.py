@@ -67,7 +67,7 @@ def test_a_sensor_that_gives_nan_at_first_is_trusted_once_it_measures():
 def test_a_robot_whose_gyro_never_measures_does_not_drive_on():
     robot = Puck(control_period=0.02, noise=1e-3, sees=lambda frame: replace(frame, gyro=np.full(3, math.nan)))
     result = driver_of(robot).run(GOAL)
-    assert result.reason == "fault" and result.fault.startswith("gyro says nothing new for 0.8")
+    assert result.reason == "fault" and result.fault.startswith("gyro says nothing usable for 0.8")
     assert robot.log[-1] == "brake"
 
 
