@@ -325,7 +325,9 @@ class Driver:
             sent, scale = self._send(decision, estimate, occupancy, now)
         if sent is None:
             self.robot.brake()
-            self.guard.braked()
+            fallen = self.guard.braked(None if estimate is None else estimate.upright)
+            if fallen is not None and not supervisor.latched:
+                self._fail(fallen, now)
             timer.mark("send")
             self._check_stop(estimate, now)
         timer.end()

@@ -224,7 +224,7 @@ def test_sensors_that_repeat_themselves_are_not_driven_on_for_long():
 
 def test_a_fallen_robot_is_a_fault():
     on_its_side = {"accelerometer": np.array([0.0, 9.81, 0.0]), "magnetometer": np.array([-0.5, 0.0, 0.0])}
-    robot = Puck(sees=lambda frame: frame if frame.stamp < 0.25 else replace(frame, **on_its_side))
+    robot = Puck(sees=lambda frame: frame if frame.stamp < 0.25 else replace(frame, **on_its_side), control_period=0.02)
     driver = driver_of(
         robot,
         Scripted(lambda step, straight: np.array([0.02, 0.0])),
