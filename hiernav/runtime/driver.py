@@ -303,7 +303,7 @@ class Driver:
             self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
             raise
         self._take_requests(now)
-        trust, doubt = self._blind.check(estimate, now)
+        trust, doubt = self._blind.check(estimate, now, self.estimator.lacks)
         late = self._overruns.check(self.loop.overruns_in_a_row)
         stamp = frame.stamp if estimate is None else estimate.stamp
         occupancy = decision = sent = None

@@ -20,6 +20,8 @@ __all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
 
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
+EARLY = 0.1
+"""A fix measured up to this long after the inertial sensors of its frame is kept until they have caught up [s]."""
 JUMP_AFTER, RESTART_AFTER = 2, 10
 """Frames in a row that must agree on another time before it is believed: a later one, and an earlier one."""
 
@@ -70,6 +72,7 @@ class Estimator:
         self._odd = 0
         self._step = 0.0
         self._fix_stamp = self._fix_shown = -math.inf
+        self._early: tuple[float, list[float]] | None = None
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
@@ -81,11 +84,18 @@ class Estimator:
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
         self._heard: dict[str, float] = {}
+        self._flaws: dict[str, str] = {}
 
     @property
     def ready(self) -> bool:
         """Whether position and heading have been measured at least once."""
         return self._has_position and self._has_yaw
+
+    @property
+    def lacks(self) -> str:
+        """Which sensors keep the first estimate waiting, and what is wrong with them; nothing once there is one."""
+        waiting = (("position_fix", self._has_position), ("magnetometer", self._has_yaw))
+        return ", ".join(f"{name}: {self._flaws.get(name, 'silent')}" for name, known in waiting if not known)
 
     def silence(self, sensor: str) -> float:
         """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
@@ -113,7 +123,7 @@ class Estimator:
             self._correct_yaw(field, forward, left)
             self._correct_velocity(readings["velocimeter"], forward, left)
             self._remember()
-            self._correct_position(frame)
+            self._take_fix(frame)
         return self._estimate() if self.ready else None
 
     def _listen(self, frame: SensorFrame) -> None:
@@ -130,9 +140,11 @@ class Estimator:
         reading = _vector(value)
         if reading is None and value is not None:
             self._watch.expect(name, self._stamp)
+            self._flaws[name] = _flaw(value, 3)
         self._watch.see(name, reading, self._stamp)
         if reading is None:
             return None
+        self._flaws.pop(name, None)
         if self._watch.repetition(name, self._stamp) >= self.config.hold_after:
             self.counts[f"{name}_frozen"] += 1
             return None
@@ -230,6 +242,7 @@ class Estimator:
         excess = abs(math.sqrt(dot(field, field)) - self._field)
         if excess > 6.0 * self.config.magnetometer_sigma + 0.05 * self._field:
             self.counts["magnetometer_rejected"] += 1
+            self._flaws["magnetometer"] = "not as strong as the world's field"
             return None
         return field
 
@@ -271,17 +284,29 @@ class Estimator:
         while self._history[0][0] < self._stamp - self.config.history:
             self._history.popleft()
 
-    def _correct_position(self, frame: SensorFrame) -> None:
+    def _take_fix(self, frame: SensorFrame) -> None:
+        """Use the fix that this frame shows for the first time, and one that came before its time."""
+        if self._early is not None and self._early[0] <= self._stamp + 1e-9:
+            (stamp, fix), self._early = self._early, None
+            self._correct_position(fix, stamp)
         if frame.position_fix is None:
             return
         stamp = self._stamp if frame.fix_stamp is None else float(frame.fix_stamp)
         if stamp == self._fix_shown:  # an adapter shows each fix until there is a newer one
             return
         self._fix_shown = stamp
-        fix = _components(frame.position_fix, 2)
-        if fix is None:
+        components = _components(frame.position_fix, 2)
+        if components is None:
             self.counts["fix_not_finite"] += 1
+            self._flaws["position_fix"] = _flaw(frame.position_fix, 2)
             return
+        self._flaws.pop("position_fix", None)
+        if self._early is None and self._stamp + 1e-9 < stamp <= self._stamp + EARLY:
+            self._early = stamp, components
+        else:
+            self._correct_position(components, stamp)
+
+    def _correct_position(self, fix: list[float], stamp: float) -> None:
         if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
             self.counts["stale_fix"] += 1
             return
@@ -355,7 +380,8 @@ class Estimator:
                 continue
             trust = Trust.LOST if silence >= lost else Trust.HOLD
             if trust > worst:
-                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s"
+                flaw = self._flaws.get(name)
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
         for name, heard in self._heard.items():
             silence = self._stamp - heard
             if silence < self.config.hold_after:
@@ -405,6 +431,12 @@ def _components(value: np.ndarray | None, size: int) -> list[float] | None:
         if not -ABSURD < component < ABSURD:
             return None
     return values
+
+
+def _flaw(value: np.ndarray, size: int) -> str:
+    """What is wrong with a measurement that `_components` refuses."""
+    count = np.size(value)
+    return f"{count} values instead of {size}" if count != size else "not finite, or absurd"
 
 
 def _mean(a: Vector, b: Vector) -> Vector:

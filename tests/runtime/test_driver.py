@@ -208,6 +208,11 @@ def test_a_robot_that_does_not_know_where_it_is_stays_braked():
     assert result.steps == 0 and math.isnan(result.distance)
 
 
+def test_a_robot_whose_fixes_have_three_coordinates_is_told_so():
+    result = driver_of(Puck(sees=lambda frame: replace(frame, position_fix=np.zeros(3)))).run(GOAL)
+    assert result.reason == "fault" and result.fault.endswith(" s (position_fix: 3 values instead of 2)")
+
+
 def test_a_robot_waits_for_its_first_fix_and_then_goes():
     robot = Puck(sees=lambda frame: frame if frame.stamp > 0.75 else replace(frame, position_fix=None))
     result = driver_of(robot).run(GOAL)
