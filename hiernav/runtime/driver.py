@@ -304,7 +304,7 @@ class Driver:
             raise
         self._take_requests(now)
         trust, doubt = self._blind.check(estimate, now, self.estimator.lacks)
-        late = self._overruns.check(self.loop.overruns_in_a_row)
+        wait = self._overruns.check(self.loop.overruns_in_a_row)
         stamp = frame.stamp if estimate is None else estimate.stamp
         occupancy = decision = sent = None
         scale = 1.0
@@ -316,11 +316,14 @@ class Driver:
             occupancy = self._occupancy = self.occupancy(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
-                decision = self._decide(self._trip, terms, estimate, occupancy, now)
+                lacks = self.pilot.lacks(terms)
+                wait = wait or lacks
+                if lacks is None:
+                    decision = self._decide(self._trip, terms, estimate, occupancy, now)
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
-            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else late, stamp, now)
+            self._choose_mode(self._trip, decision, doubt if trust is Trust.HOLD else wait, stamp, now)
         if supervisor.driving and decision is not None and estimate is not None and occupancy is not None:
             sent, scale = self._send(decision, estimate, occupancy, now)
         if sent is None:
