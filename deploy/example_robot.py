@@ -30,7 +30,9 @@ class ExampleRobot:
     def read(self) -> SensorFrame:
         """The newest values. What a sensor does not give in time is None: never wait, and never repeat the last value.
 
-        All in SI units and in the body frame (x forward, y left, z up); the stamp is a monotonic clock's.
+        Called several times in a control period; the adapter gathers what came since the loop looked last, so that each
+        sensor may have a rate of its own. All in SI units and in the body frame (x forward, y left, z up); the stamp is
+        a monotonic clock's.
         """
         board = self._board
         now = board.update()

@@ -81,6 +81,8 @@ NOISE_FREE = Case(noise=0.0)
 class RawEstimator:
     """What the sensors say, as an estimate: the last fix, the magnetometer's heading, the velocimeter's velocity."""
 
+    lacks = ""
+
     def __init__(self, config: EstimatorConfig) -> None:
         self.config, self.counts = config, Counter[str]()
         self.reset()

@@ -317,13 +317,14 @@ class Driver:
             timer.mark("read")
             self._estimate = estimate = self.estimator.update(frame)
             self._unshown = seen = _Seen(frame, truth, estimate)
+            terms = self._terms.fill(frame)
             timer.mark("estimate")
         except Exception:
             self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
             raise
         self._take_requests(now)
-        trust, doubt = self._blind.check(estimate, now)
-        late = self._overruns.check(self.loop.overruns_in_a_row)
+        trust, doubt = self._blind.check(estimate, now, self.estimator.lacks)
+        wait = self._overruns.check(self.loop.overruns_in_a_row)
         stamp = frame.stamp if estimate is None else estimate.stamp
         if self._trip is not None:
             self._trip.last = stamp
@@ -333,16 +334,21 @@ class Driver:
             seen.occupancy = occupancy = self._occupancy = self.occupancy(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
-                seen.decision = self._decide(self._trip, frame, estimate, occupancy, now)
+                lacks = self.pilot.lacks(terms)
+                wait = wait or lacks
+                if lacks is None:
+                    seen.decision = self._decide(self._trip, terms, estimate, occupancy, now)
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
-            self._choose_mode(self._trip, seen.decision, doubt if trust is Trust.HOLD else late, stamp, now)
+            self._choose_mode(self._trip, seen.decision, doubt if trust is Trust.HOLD else wait, stamp, now)
         if supervisor.driving and seen.decision is not None and estimate is not None and seen.occupancy is not None:
             seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, now)
         if seen.sent is None:
             self.robot.brake()
-            self.guard.braked()
+            fallen = self.guard.braked(None if estimate is None else estimate.upright)
+            if fallen is not None and not supervisor.latched:
+                self._fail(fallen, now)
             timer.mark("send")
             self._check_stop(estimate, now)
         timer.end()
@@ -392,11 +398,11 @@ class Driver:
         return self._trip is None
 
     def _decide(
-        self, trip: Trip, frame: SensorFrame, estimate: Estimate, occupancy: OccupancyMap, now: float
+        self, trip: Trip, terms: dict[str, np.ndarray], estimate: Estimate, occupancy: OccupancyMap, now: float
     ) -> Decision:
         if not self.supervisor.driving:
             self.pilot.rest()
-        decision = self.pilot.act(now, estimate, self._terms.fill(frame), trip.goal, occupancy)
+        decision = self.pilot.act(now, estimate, terms, trip.goal, occupancy)
         if decision.reason is not TerminationReason.NONE:
             trip.replans[decision.reason.name.lower()] += 1
             self.timer.mark_split("infer", "plan", decision.plan_seconds)

@@ -19,7 +19,7 @@ from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.policy import check_golden, load_policies, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.robot import READINGS
+from hiernav.runtime.robot import READINGS, SIZES, SensorFrame
 from hiernav.runtime.settings import Settings
 from hiernav.runtime.timing import Histogram
 
@@ -80,6 +80,7 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None) -> dict[str, Any]:
     frame = robot.read()
     present = [name for name in READINGS if getattr(frame, name) is not None]
     absent = [name for name in READINGS if name not in present]
+    wrong = _wrong_sizes(frame, bundle)
     broken = [name for name in present if not np.isfinite(getattr(frame, name)).all()]
     return {
         "control period": f"{1e3 * robot.control_period:g} ms",
@@ -87,8 +88,22 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None) -> dict[str, Any]:
         "sensors": ", ".join([*present, *frame.extra]) or "missing",
         "silent": f"missing: {', '.join(absent)}" if absent else "none",
         "not finite": f"missing: {', '.join(broken)}" if broken else "none",
+        **({"error": f"sensors of another size: {', '.join(wrong)}"} if wrong else {}),
         **{f"adapter {name}": text for name, text in robot.realtime.items()},
     }
+
+
+def _wrong_sizes(frame: SensorFrame, bundle: Bundle | None) -> list[str]:
+    """Each sensor that gives more or fewer values than estimator and skill take."""
+    sizes = dict(SIZES)
+    if bundle is not None:
+        sizes |= {term.name: term.size for term in bundle.layout.terms}
+    given = {name: getattr(frame, name) for name in READINGS} | dict(frame.extra)
+    return [
+        f"{name} has {np.size(value)} values, {sizes[name]} are expected"
+        for name, value in given.items()
+        if value is not None and np.size(value) != sizes.get(name, np.size(value))
+    ]
 
 
 def _check_filter() -> dict[str, Any]:

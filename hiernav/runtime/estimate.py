@@ -59,9 +59,9 @@ class EstimatorConfig:
     max_jump: float = 6.0
     """A gyro reading that differs more than this from the last is taken for a spike [rad/s]."""
     hold_after: float = 0.25
-    """An inertial sensor that says nothing new for this long is not driven without [s]."""
+    """A sensor, the position fix aside, that says nothing usable for this long is not driven without [s]."""
     lost_after: float = 0.8
-    """An inertial sensor that says nothing new for this long is lost [s]."""
+    """A sensor, the position fix aside, that says nothing usable for this long is lost [s]."""
     fix_hold_after: float = 2.0
     """Without a new position fix for this long, dead reckoning is not driven on [s]."""
     fix_lost_after: float = 5.0

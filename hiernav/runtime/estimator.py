@@ -12,15 +12,16 @@ import numpy as np
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
-from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
+from hiernav.runtime.robot import ABSURD, VECTOR_SENSORS, SensorFrame
+from hiernav.runtime.terms import is_sound
 from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
 __all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
 
-ABSURD = 1e6
-"""No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
+EARLY = 0.1
+"""A fix measured up to this long after the inertial sensors of its frame is kept until they have caught up [s]."""
 JUMP_AFTER, RESTART_AFTER = 2, 10
 """Frames in a row that must agree on another time before it is believed: a later one, and an earlier one."""
 
@@ -71,6 +72,7 @@ class Estimator:
         self._odd = 0
         self._step = 0.0
         self._fix_stamp = self._fix_shown = -math.inf
+        self._early: tuple[float, list[float]] | None = None
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
@@ -81,14 +83,24 @@ class Estimator:
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
+        self._heard: dict[str, float] = {}
+        self._flaws: dict[str, str] = {}
 
     @property
     def ready(self) -> bool:
         """Whether position and heading have been measured at least once."""
         return self._has_position and self._has_yaw
 
+    @property
+    def lacks(self) -> str:
+        """Which sensors keep the first estimate waiting, and what is wrong with them; nothing once there is one."""
+        waiting = (("position_fix", self._has_position), ("magnetometer", self._has_yaw))
+        return ", ".join(f"{name}: {self._flaws.get(name, 'silent')}" for name, known in waiting if not known)
+
     def silence(self, sensor: str) -> float:
-        """For how long a sensor, such as "velocimeter", has said nothing new [s]; 0 for one never heard of."""
+        """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
+        if sensor in self._heard:
+            return self._stamp - self._heard[sensor]
         return self._watch.silence(sensor, self._stamp)
 
     def update(self, frame: SensorFrame) -> Estimate | None:
@@ -102,6 +114,7 @@ class Estimator:
             The state at the newest stamp; None until position and heading are known.
         """
         if self._accept_stamp(float(frame.stamp)):
+            self._listen(frame)
             readings = {name: self._read(name, getattr(frame, name)) for name in VECTOR_SENSORS}
             field = self._trusted_field(readings["magnetometer"])
             turn = self._turn(frame.rotation)
@@ -110,18 +123,33 @@ class Estimator:
             self._correct_yaw(field, forward, left)
             self._correct_velocity(readings["velocimeter"], forward, left)
             self._remember()
-            self._correct_position(frame)
+            self._take_fix(frame)
         return self._estimate() if self.ready else None
+
+    def _listen(self, frame: SensorFrame) -> None:
+        """Note which of the sensors that only the skill needs say something that it can use: lidar and robot's own."""
+        heard, stamp = self._heard, self._stamp
+        if frame.lidar is not None and (is_sound("lidar", frame.lidar) or "lidar" not in heard):
+            heard["lidar"] = stamp
+        for name, value in frame.extra.items():
+            if is_sound(name, value) or name not in heard:
+                heard[name] = stamp
 
     def _read(self, name: str, value: np.ndarray | None) -> Vector | None:
         """A sensor's reading, unless it is missing, garbage, or frozen for too long to be believed."""
         reading = _vector(value)
         if reading is None and value is not None:
             self._watch.expect(name, self._stamp)
+            self._flaws[name] = _flaw(value, 3)
         self._watch.see(name, reading, self._stamp)
-        if reading is not None and self._watch.silence(name, self._stamp) >= self.config.hold_after:
+        if reading is None:
+            return None
+        self._flaws.pop(name, None)
+        if self._watch.repetition(name, self._stamp) >= self.config.hold_after:
             self.counts[f"{name}_frozen"] += 1
             return None
+        if name == "accelerometer":  # what it says is weighed, never rejected
+            self._watch.believe(name, self._stamp)
         return reading
 
     def _accept_stamp(self, stamp: float) -> bool:
@@ -132,10 +160,11 @@ class Estimator:
                 self.counts["stale_frame"] += 1
                 return False
             self.counts["gap" if step > 0.0 else "clock_restart"] += 1
-            sensors, first = self._watch.sensors, True
+            sensors, terms, first = self._watch.sensors, self._heard, True
             self.reset()
             for name in sensors:
                 self._watch.expect(name, stamp)
+            self._heard = dict.fromkeys(terms, stamp)
         self._step = 0.0 if first else step
         self._stamp, self._odd = stamp, 0
         return True
@@ -174,6 +203,7 @@ class Estimator:
             integrated = (turn[0] / dt, turn[1] / dt, turn[2] / dt)
             if math.dist(integrated, gyro) <= 2.0 * config.max_jump:
                 mean, change, accuracy = integrated, 0.0, _INTEGRATED
+                self._watch.believe("gyro", self._stamp)  # legs hammer: not every leap is a spike
             else:
                 self.counts["rotation_rejected"] += 1
         if config.tilts:
@@ -192,13 +222,16 @@ class Estimator:
 
     def _measured_rate(self, rate: Vector | None) -> tuple[Vector, float]:
         """The body rate and how much it may have changed within the tick [rad/s]; the last one if none was measured."""
-        if rate is None or max(map(abs, rate)) > MAX_RATE:
+        if rate is None:
+            return self._rate, 1.0
+        if max(map(abs, rate)) > MAX_RATE:
+            self.counts["gyro_rejected"] += 1
             return self._rate, 1.0
         jump = math.dist(rate, self._rate)
         # One reading far off is a spike; three in a row are the truth.
         if jump > self.config.max_jump and not self._reject("gyro", rate, self.config.max_jump):
             return self._rate, 1.0
-        self._accept("gyro")
+        self._accept("gyro", self._stamp)
         # What a jump adds to the angle is as uncertain as it is large.
         return rate, jump
 
@@ -209,6 +242,7 @@ class Estimator:
         excess = abs(math.sqrt(dot(field, field)) - self._field)
         if excess > 6.0 * self.config.magnetometer_sigma + 0.05 * self._field:
             self.counts["magnetometer_rejected"] += 1
+            self._flaws["magnetometer"] = "not as strong as the world's field"
             return None
         return field
 
@@ -228,7 +262,7 @@ class Estimator:
             if not self._reject("magnetometer", (miss,)):
                 return
             self._filter.replace((YAW,), (wrap(yaw),), variance)
-        self._accept("magnetometer")
+        self._accept("magnetometer", self._stamp)
 
     def _correct_velocity(self, velocity: Vector | None, forward: Vector, left: Vector) -> None:
         if velocity is None:
@@ -242,7 +276,7 @@ class Estimator:
             if not self._reject("velocimeter", miss):
                 return
             self._filter.replace(VELOCITY, (ahead, aside), variance)
-        self._accept("velocimeter")
+        self._accept("velocimeter", self._stamp)
 
     def _remember(self) -> None:
         x, y = self._filter.x[:2]
@@ -250,23 +284,35 @@ class Estimator:
         while self._history[0][0] < self._stamp - self.config.history:
             self._history.popleft()
 
-    def _correct_position(self, frame: SensorFrame) -> None:
+    def _take_fix(self, frame: SensorFrame) -> None:
+        """Use the fix that this frame shows for the first time, and one that came before its time."""
+        if self._early is not None and self._early[0] <= self._stamp + 1e-9:
+            (stamp, fix), self._early = self._early, None
+            self._correct_position(fix, stamp)
         if frame.position_fix is None:
             return
         stamp = self._stamp if frame.fix_stamp is None else float(frame.fix_stamp)
         if stamp == self._fix_shown:  # an adapter shows each fix until there is a newer one
             return
         self._fix_shown = stamp
-        fix = _components(frame.position_fix, 2)
-        if fix is None:
+        components = _components(frame.position_fix, 2)
+        if components is None:
             self.counts["fix_not_finite"] += 1
+            self._flaws["position_fix"] = _flaw(frame.position_fix, 2)
             return
+        self._flaws.pop("position_fix", None)
+        if self._early is None and self._stamp + 1e-9 < stamp <= self._stamp + EARLY:
+            self._early = stamp, components
+        else:
+            self._correct_position(components, stamp)
+
+    def _correct_position(self, fix: list[float], stamp: float) -> None:
         if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
             self.counts["stale_fix"] += 1
             return
         self._fix_stamp = stamp
         self._watch.see("position_fix", tuple(fix), stamp)
-        if self._watch.silence("position_fix", stamp) >= self.config.hold_after:
+        if self._watch.repetition("position_fix", stamp) >= self.config.hold_after:
             self.counts["position_fix_frozen"] += 1
             return
         then = self._position_at(stamp)
@@ -281,7 +327,7 @@ class Estimator:
             self._has_position = True
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)
-        self._accept("position_fix")
+        self._accept("position_fix", stamp)
 
     def _position_at(self, stamp: float) -> tuple[float, float]:
         """Where the filter has the robot at `stamp`, which lies within the history [m]."""
@@ -301,8 +347,10 @@ class Estimator:
             entry[1] += dx
             entry[2] += dy
 
-    def _accept(self, sensor: str) -> None:
+    def _accept(self, sensor: str, stamp: float) -> None:
+        """A measurement taken at `stamp` [s] was used."""
         self._rejected[sensor] = 0
+        self._watch.believe(sensor, stamp)
 
     def _reject(self, sensor: str, miss: tuple[float, ...], spread: float | None = None) -> bool:
         """Count a rejected measurement.
@@ -332,7 +380,15 @@ class Estimator:
                 continue
             trust = Trust.LOST if silence >= lost else Trust.HOLD
             if trust > worst:
-                worst, why = trust, f"{name} says nothing new for {silence:.2f} s"
+                flaw = self._flaws.get(name)
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
+        for name, heard in self._heard.items():
+            silence = self._stamp - heard
+            if silence < self.config.hold_after:
+                continue
+            trust = Trust.LOST if silence >= self.config.lost_after else Trust.HOLD
+            if trust > worst:
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s"
         return worst, why
 
     def _estimate(self) -> Estimate:
@@ -375,6 +431,12 @@ def _components(value: np.ndarray | None, size: int) -> list[float] | None:
         if not -ABSURD < component < ABSURD:
             return None
     return values
+
+
+def _flaw(value: np.ndarray, size: int) -> str:
+    """What is wrong with a measurement that `_components` refuses."""
+    count = np.size(value)
+    return f"{count} values instead of {size}" if count != size else "not finite, or absurd"
 
 
 def _mean(a: Vector, b: Vector) -> Vector:

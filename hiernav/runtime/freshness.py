@@ -1,4 +1,4 @@
-"""Which sensors still say something new, and which have gone silent or repeat themselves."""
+"""Which sensors still say something new and credible, and which have gone silent, repeat themselves or only lie."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class _Sensor:
     sigma: float
     value: Reading
     """The last one; nothing if it never gave any."""
-    seen: float
+    believed: float
     new: float
     changes: int = 0
     repeats: int = 0
@@ -33,7 +33,7 @@ class _Sensor:
 
 
 class SensorWatch:
-    """Remembers when each sensor last said something new.
+    """Remembers when each sensor last said something new that was believed.
 
     Noise makes a sensor differ from one reading to the next. One that has done so, then repeats itself to the bit
     under fresh stamps while others go on changing, is frozen. A reading of nothing but zeros is what wheel encoders
@@ -65,10 +65,10 @@ class SensorWatch:
             return
         sensor = self._sensors.get(name)
         if sensor is None or not sensor.value:
-            new = _Sensor(self._sigma[name], value, stamp, stamp, stir_from=value, leap_from=value)
+            since = stamp if sensor is None else sensor.believed
+            new = _Sensor(self._sigma[name], value, since, stamp, stir_from=value, leap_from=value)
             self._sensors[name] = new
             return
-        sensor.seen = stamp
         if value == sensor.value:
             sensor.repeats += 1
             return
@@ -82,12 +82,20 @@ class SensorWatch:
         if math.dist(value, sensor.leap_from) > LEAP * sensor.sigma:
             sensor.leap_from, sensor.leapt = value, stamp
 
+    def believe(self, name: str, stamp: float) -> None:
+        """The reading that was seen last was used, at `stamp` [s]: what is only ever rejected is as good as silence."""
+        self._sensors[name].believed = stamp
+
     def silence(self, name: str, stamp: float) -> float:
-        """For how long a sensor has said nothing new [s]; 0 for one that the robot may not have."""
+        """For how long a sensor has said nothing new that was believed [s]; 0 for one that the robot may not have."""
         sensor = self._sensors.get(name)
         if sensor is None:
             return 0.0
-        return stamp - (sensor.new if self.frozen(name) else sensor.seen)
+        return stamp - (min(sensor.new, sensor.believed) if self.frozen(name) else sensor.believed)
+
+    def repetition(self, name: str, stamp: float) -> float:
+        """For how long a sensor has repeated itself that should not [s]; 0 for one that does not."""
+        return stamp - self._sensors[name].new if self.frozen(name) else 0.0
 
     def frozen(self, name: str) -> bool:
         """Whether a sensor that should not repeat itself does, while others change."""

@@ -24,7 +24,7 @@ class GuardConfig:
     tilt_limit: float | None = None
     """Angle of the body's z axis to the vertical that is a fault [rad]; None for a robot that cannot tilt."""
     max_tilted: int = 3
-    """Ticks in a row beyond the tilt limit that are a fault."""
+    """Ticks in a row beyond the tilt limit that are a fault; each of them is braked."""
     slow_ttc: float | None = None
     """Below this time to collision with the known map commands are scaled down in proportion [s]; None never does."""
     slowed: tuple[int, ...] | None = None
@@ -91,11 +91,18 @@ class Guard:
         """A new run begins from standstill; counts are kept."""
         self.braked()
         self._non_finite = 0
-        self._tilted = 0
 
-    def braked(self) -> None:
-        """The robot got the brake, past this guard: what follows starts from zero."""
+    def braked(self, upright: float | None = None) -> str | None:
+        """The robot got the brake, past this guard: what follows starts from zero.
+
+        Args:
+            upright: as in `check`; a robot may fall while it is braked, too.
+
+        Returns:
+            Why that is a fault, or None.
+        """
         self._last = [0.0] * self.action_dim
+        return self._tilt_fault(upright)
 
     def check(
         self,
@@ -115,7 +122,7 @@ class Guard:
             velocity: forward and left, in the body's frame [m/s]; tells what `GuardConfig.drive` spares.
         """
         fault = self._tilt_fault(upright)
-        if fault is not None:
+        if self._tilted:  # lying down it must not move, whether that is a fault yet or not
             return Guarded(self._brake(), fault)
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self.action_dim,):
@@ -173,10 +180,8 @@ class Guard:
         return Guarded(self._brake(), fault)
 
     def _tilt_fault(self, upright: float | None) -> str | None:
-        if upright is None or upright >= self._least_upright:
+        if self.config.tilt_limit is None or upright is None or upright >= self._least_upright:
             self._tilted = 0
-            return None
-        if self.config.tilt_limit is None:
             return None
         self.counts["tilted"] += 1
         self._tilted += 1
@@ -187,5 +192,5 @@ class Guard:
 
     def _brake(self) -> np.ndarray:
         # The stop is not slewed; what follows it starts from zero again.
-        self.braked()
+        self._last = [0.0] * self.action_dim
         return np.zeros(self.action_dim)

@@ -44,6 +44,16 @@ class Mailbox:
         self._written = max(self._number(place) for place in self._places)
         self._read = 0
 
+    @property
+    def written(self) -> int:
+        """Number of the newest message that was put."""
+        return self._written
+
+    @property
+    def taken(self) -> int:
+        """Number of the newest message that was got."""
+        return self._read
+
     @staticmethod
     def size(capacity: int) -> int:
         """Bytes of memory that a mailbox takes."""

@@ -12,6 +12,9 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
 from hiernav.runtime.estimate import Estimate
 
+GUIDES = ("waypoints", "goal", "clock")
+"""Observation terms that the agent adds to those of the robot's sensors."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -123,6 +126,7 @@ class Pilot:
             max_age: of the state a plan was made from, when it arrives [s].
         """
         self.agent, self.link, self.max_age = agent, link, max_age
+        self._sensed = [name for name in agent.layout.names if name not in GUIDES]
         self._sound = SoundPlanner(agent.option.planner)
         agent.option.planner = self._sound
         self.late = 0
@@ -169,6 +173,11 @@ class Pilot:
         self._asked_at = None
         if self.link is not None:
             self.link.forget()
+
+    def lacks(self, terms: Mapping[str, np.ndarray]) -> str | None:
+        """Which sensor that the skill observes has never spoken, as a reason to wait; None if all have."""
+        silent = [name for name in self._sensed if name not in terms]
+        return f"nothing from {', '.join(silent)} yet" if silent else None
 
     def rest(self) -> None:
         """The robot was made to wait, and must not be thought stuck for it."""

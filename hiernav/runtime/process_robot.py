@@ -17,7 +17,7 @@ import numpy as np
 from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import END, STATUS
+from hiernav.runtime.robot_process import END, STATUS, TAKEN
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command
 
 
@@ -106,6 +106,7 @@ class ProcessRobot:
             message = self._wait_for_frame()
         if message is not None:
             self._message, self._newest = message, decode_frame(message)
+            self._status[TAKEN] = self._frames.taken
         else:
             self._require_adapter()
         assert self._newest is not None

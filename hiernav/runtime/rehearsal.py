@@ -56,7 +56,10 @@ class Rehearsal:
             self._pilot.drop()
         self._stamp += self._period
         self._estimator.update(replace(frame, stamp=self._stamp, fix_stamp=None))
-        decision = self._pilot.act(self._stamp, estimate, self._terms.fill(frame), goal, occupancy)
+        terms = self._terms.fill(frame)
+        if self._pilot.lacks(terms) is not None:  # a sensor that speaks less often has not been in a frame yet
+            return
+        decision = self._pilot.act(self._stamp, estimate, terms, goal, occupancy)
         x, y, _ = estimate.pose.tolist()
         ttc = time_to_collision(occupancy, (x, y), (1.0, 0.0), self._radius, 0.5)
         self._guard.check(decision.action, estimate.upright, ttc, velocity=estimate.body_velocity())

@@ -152,9 +152,10 @@ class Replay:
     def _values(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
         """Name, recorded and replayed value of everything that was computed in a tick."""
         estimate = self._estimator.update(tick.frame)
+        terms = self._terms.fill(tick.frame)
         yield "estimate", _state(tick.estimate), _state(estimate)
         if tick.observation is not None:
-            yield from self._decision(tick)
+            yield from self._decision(tick, terms)
         if tick.sent is not None and tick.proposed is not None:
             yield "sent", tick.sent, self._guarded(tick, tick.proposed)
         elif tick.sent is None:
@@ -167,14 +168,13 @@ class Replay:
         velocity = estimate.body_velocity()
         return self._guard.check(proposed, estimate.upright, speed=tick.speed_scale, velocity=velocity).action
 
-    def _decision(self, tick: TickRecord) -> Iterator[tuple[str, object, object]]:
+    def _decision(self, tick: TickRecord, terms: dict[str, np.ndarray]) -> Iterator[tuple[str, object, object]]:
         if tick.estimate is None or tick.goal is None or tick.occupancy is None:
             raise LogError(f"{self.log.path}: tick {tick.index} decided without estimate, goal or map")
         if self._asked is not None:
             self._asked.stamp = tick.estimate.stamp
             if tick.replanned:
                 yield from self._answer(tick, self._asked)
-        terms = self._terms.fill(tick.frame)
         self._recovery.plan = tick.plan if tick.recovering else None
         step = self._agent.act(tick.estimate.pose[None], terms, tick.goal[None], (tick.occupancy,))
         yield "reason", int(tick.reason), int(step.reason[0])

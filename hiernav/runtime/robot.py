@@ -12,6 +12,10 @@ VECTOR_SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
 _TERMS = (*VECTOR_SENSORS, "lidar")
 READINGS = (*_TERMS, "position_fix", "rotation")
 """Fields of a frame that are an array, or None where nothing was read."""
+SIZES = {**dict.fromkeys(VECTOR_SENSORS, 3), "position_fix": 2, "rotation": 4}
+"""Number of values of those that are the same for every robot."""
+ABSURD = 1e6
+"""No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class SensorFrame:
     velocimeter: np.ndarray | None = None
     """(3,) velocity of the body origin in the body frame [m/s]."""
     lidar: np.ndarray | None = None
-    """(10,) closeness, body frame."""
+    """(10,) closeness in [0, 1], body frame."""
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     """The robot's own observation terms by name."""
     position_fix: np.ndarray | None = None

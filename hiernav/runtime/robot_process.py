@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
+from hiernav.runtime.gathering import Gathering
 from hiernav.runtime.mailbox import Mailbox, mapped
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
@@ -33,7 +34,9 @@ from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 END = b"e"
 """News that this process is not needed any more, and that the robot stands."""
 STATUS = 64
-"""Bytes at the front of the memory: what the watchdog has done."""
+"""Bytes at the front of the memory: how often the watchdog braked, and when last; which frame the loop has taken."""
+TAKEN = 2
+"""Place of the latter among them; the control process writes it."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0
@@ -104,6 +107,7 @@ class Adapter:
         self._truth = getattr(robot, "truth", None)
         self._shown: object = None
         self._fix: tuple[np.ndarray, float] | None = None
+        self._gathering = Gathering(self._period)
         self._braked = 0.0
         self._introduced = False
 
@@ -196,7 +200,8 @@ class Adapter:
         if frame is self._shown:
             return
         self._shown = frame
-        self._frames.put(encode_frame(self._with_newest_fix(frame), None if self._truth is None else self._truth()))
+        whole = self._gathering.add(self._with_newest_fix(frame), self._frames.written + 1, int(self._status[TAKEN]))
+        self._frames.put(encode_frame(whole, None if self._truth is None else self._truth()))
 
     def _with_newest_fix(self, frame: SensorFrame) -> SensorFrame:
         """The frame with the newest fix, which its stamp tells from a newer one: the loop sees but the newest frame."""
@@ -222,6 +227,7 @@ class Adapter:
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         self._shown = self._fix = None
+        self._gathering.forget()
         self._publish()
         self._answer(answer)
         return True

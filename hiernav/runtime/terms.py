@@ -4,22 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.robot import ABSURD, SensorFrame
+
+_LIMIT = ABSURD * ABSURD
+
+
+def is_sound(name: str, value: np.ndarray) -> bool:
+    """Whether every component of an observation term is finite and within what its sensor can read."""
+    # One short call finds NaN, infinity and absurd numbers alike; the square of a length may be too strict by a factor.
+    if not np.vdot(value, value) < _LIMIT:
+        return False
+    return name != "lidar" or all(0.0 <= closeness <= 1.0 for closeness in value.ravel().tolist())
 
 
 class TermHold:
-    """Observation terms without holes: what a sensor does not give, or gives as NaN, keeps its last good value."""
+    """Observation terms without holes: what a sensor does not give, or gives as nonsense, keeps its last good value."""
 
     def __init__(self) -> None:
         self._last: dict[str, np.ndarray] = {}
 
     def fill(self, frame: SensorFrame) -> dict[str, np.ndarray]:
-        """Terms by name, (1, d) each. A sensor that never gave a good value reads zero, one never seen is absent."""
+        """Terms by name, (1, d) each, after taking in a frame; once per tick.
+
+        A component that was never good reads zero, a sensor never seen is absent.
+        """
         last = self._last
         for name, value in frame.terms().items():
             value = np.asarray(value, dtype=np.float64).reshape(1, -1)
-            # the square of the length is finite only if every component is: one short call instead of three
-            if not np.vdot(value, value) < np.inf:
-                value = np.where(np.isfinite(value), value, last.get(name, np.zeros_like(value)))
+            if not is_sound(name, value):
+                good = (0.0 <= value) & (value <= 1.0) if name == "lidar" else np.abs(value) < ABSURD
+                before = last.get(name)
+                if before is None or before.shape != value.shape:
+                    before = np.zeros_like(value)
+                value = np.where(good, value, before)
             last[name] = value
         return dict(last)

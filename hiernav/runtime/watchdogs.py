@@ -29,14 +29,17 @@ class BlindWatch:
         if math.isinf(self._stamp):
             self._since = now
 
-    def check(self, estimate: Estimate | None, now: float) -> tuple[Trust, str]:
-        """What the newest estimate is good for at `now` [s], on the loop's clock, and what it suffers from."""
+    def check(self, estimate: Estimate | None, now: float, lacks: str = "") -> tuple[Trust, str]:
+        """What the newest estimate is good for at `now` [s], on the loop's clock, and what it suffers from.
+
+        `lacks` says what the first one waits for.
+        """
         if self._since is None:
             self._since = now
         if estimate is None:
             waited = now - self._since
             if math.isinf(self._stamp):
-                why = f"no position and heading for {waited:.2f} s"
+                why = f"no position and heading for {waited:.2f} s{f' ({lacks})' if lacks else ''}"
                 return (Trust.LOST if waited > self.first_after else Trust.HOLD), why
         elif estimate.stamp != self._stamp:  # also an earlier one: the robot's clock has started again
             self._since, self._stamp = now, estimate.stamp

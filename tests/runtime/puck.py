@@ -97,6 +97,9 @@ class Scripted:
         self.steps = 0
         self.resets += 1
 
+    def lacks(self, terms: Mapping[str, np.ndarray]) -> str | None:
+        return None
+
     def rest(self) -> None: ...
 
     def drop(self) -> None:

@@ -243,6 +243,11 @@ def test_a_robot_that_does_not_know_where_it_is_stays_braked():
     assert result.steps == 0 and math.isnan(result.distance)
 
 
+def test_a_robot_whose_fixes_have_three_coordinates_is_told_so():
+    result = driver_of(Puck(sees=lambda frame: replace(frame, position_fix=np.zeros(3)))).run(GOAL)
+    assert result.reason == "fault" and result.fault.endswith(" s (position_fix: 3 values instead of 2)")
+
+
 def test_a_robot_waits_for_its_first_fix_and_then_goes():
     robot = Puck(sees=lambda frame: frame if frame.stamp > 0.75 else replace(frame, position_fix=None))
     result = driver_of(robot).run(GOAL)
@@ -306,7 +311,7 @@ def test_sensors_that_repeat_themselves_are_not_driven_on_for_long():
 
 def test_a_fallen_robot_is_a_fault():
     on_its_side = {"accelerometer": np.array([0.0, 9.81, 0.0]), "magnetometer": np.array([-0.5, 0.0, 0.0])}
-    robot = Puck(sees=lambda frame: frame if frame.stamp < 0.25 else replace(frame, **on_its_side))
+    robot = Puck(sees=lambda frame: frame if frame.stamp < 0.25 else replace(frame, **on_its_side), control_period=0.02)
     driver = driver_of(
         robot,
         Scripted(lambda step, straight: np.array([0.02, 0.0])),

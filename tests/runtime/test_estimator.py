@@ -100,6 +100,50 @@ def test_a_fix_that_is_older_or_from_the_future_is_dropped(fix_stamp):
     assert estimator.counts["stale_fix"] == 1
 
 
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("shown", ["once", "until the next"])
+@pytest.mark.parametrize("ahead", [0.001, 0.03])
+def test_a_fix_measured_a_moment_after_its_frame_is_used_once_the_frames_have_caught_up(shown, ahead, every):
+    """As of a beacon that is read in the same call, after the gyro."""
+    motion = recorded("point")
+    rng = np.random.default_rng(0)
+    estimator, shows, worst = estimator_for(motion), {}, 0.0
+    for k, frame in enumerate(frames(motion)):
+        if shown == "once":
+            shows = {"position_fix": None, "fix_stamp": None}
+        if k % every == 0:
+            fix = motion.poses[k, :2] + FIX_SIGMA * rng.standard_normal(2)
+            shows = {"position_fix": fix, "fix_stamp": frame.stamp + ahead}
+        estimate = estimator.update(replace(frame, **shows))
+        worst = max(worst, estimator.silence("position_fix"))
+    assert estimate is not None and np.linalg.norm(estimate.pose[:2] - motion.poses[-1, :2]) < 0.05
+    assert worst < 0.13
+    assert estimator.counts["stale_fix"] == 0 or (every, ahead) == (1, 0.03), "fixes overtake the one that waits"
+
+
+def test_a_sensor_of_another_size_is_named():
+    motion = recorded("point")
+    stream = list(frames(motion))
+    estimator = estimator_for(motion)
+    estimator.update(replace(stream[0], position_fix=np.zeros(3)))
+    assert estimator.lacks == "position_fix: 3 values instead of 2"
+    estimator.update(stream[1])
+    assert estimator.lacks == "position_fix: 3 values instead of 2"
+    estimator.update(replace(stream[5], magnetometer=None))
+    assert estimator.lacks == ""
+    for frame in stream[6:30]:
+        estimate = estimator.update(replace(frame, gyro=np.zeros(4)))
+    assert estimate is not None and estimate.trust is Trust.HOLD
+    assert estimate.why.startswith("gyro says nothing usable for") and "4 values instead of 3" in estimate.why
+
+
+def test_a_compass_without_the_worlds_field_is_named():
+    motion = recorded("point")
+    estimator = estimator_for(motion)
+    estimator.update(replace(next(frames(motion)), magnetometer=np.array([40.0, 0.0, 0.0]), position_fix=None))
+    assert estimator.lacks == "position_fix: silent, magnetometer: not as strong as the world's field"
+
+
 @pytest.mark.parametrize("latency", [0.0, 0.08, 0.9])
 def test_a_fix_that_is_shown_until_the_next_one_counts_once(latency):
     """Be it good, garbage, or older than the memory; and it is no sign of life of a sensor that says nothing more."""

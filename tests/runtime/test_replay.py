@@ -71,6 +71,23 @@ def test_waiting_and_recovering_are_replayed_too(tmp_path, bundle):
     assert result.compared["sent"] > 150
 
 
+def test_sensors_that_lie_fall_silent_or_speak_late_are_replayed_too(tmp_path, bundle):
+    rng = np.random.default_rng(0)
+
+    def damage(frame):
+        if frame.stamp < 0.05 or 0.3 < frame.stamp < 0.6:
+            frame = replace(frame, lidar=None)
+        if 0.8 < frame.stamp < 1.2:
+            frame = replace(frame, velocimeter=rng.uniform(-40.0, 40.0, 3))
+        return frame if frame.fix_stamp is None else replace(frame, fix_stamp=frame.fix_stamp + 0.001)
+
+    log = recorded(tmp_path / "lies.mcap", {"seed": 1, "damage": damage})
+    held = {tick.estimate.why.split()[0] for tick in log.ticks() if tick.estimate is not None and tick.estimate.why}
+    assert held == {"lidar", "velocimeter"}
+    result = Replay(log, bundle).compare()
+    assert result.equal and result.compared["sent"] > 50, result.difference
+
+
 def test_a_clock_that_starts_again_and_a_stamp_far_ahead_are_replayed_too(tmp_path, bundle):
     def other_time(frame):
         ahead = 1e9 if 0.49 < frame.stamp < 0.51 else 50.0 if frame.stamp < 0.7 else -0.7

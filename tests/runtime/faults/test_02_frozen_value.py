@@ -36,7 +36,7 @@ def test_a_frozen_sensor_asks_to_hold_within_half_a_second(robot, sensor):
     errors = follow(motion, estimator, frames(motion), freeze(sensor))
     held = next(each for each in errors.estimates if each.trust is not Trust.GOOD)
     assert BEGIN < held.stamp <= BEGIN + 0.5
-    assert held.why.startswith(f"{sensor} says nothing new")
+    assert held.why.startswith(f"{sensor} says nothing usable")
     assert estimator.counts[f"{sensor}_frozen"] > 0
     assert errors.estimates[-1].trust is Trust.LOST
 

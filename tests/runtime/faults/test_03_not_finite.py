@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from puck import GOAL, Puck, driver_of
+from puck import GOAL, Puck, Scripted, driver_of
 from runtime_motion import FIX_SIGMA, estimator_for, follow, frames, recorded
 
 from hiernav.runtime.estimator import Trust
@@ -67,5 +67,29 @@ def test_a_sensor_that_gives_nan_at_first_is_trusted_once_it_measures():
 def test_a_robot_whose_gyro_never_measures_does_not_drive_on():
     robot = Puck(control_period=0.02, noise=1e-3, sees=lambda frame: replace(frame, gyro=np.full(3, math.nan)))
     result = driver_of(robot).run(GOAL)
-    assert result.reason == "fault" and result.fault.startswith("gyro says nothing new for 0.8")
+    assert result.reason == "fault" and result.fault.startswith("gyro says nothing usable for 0.8")
     assert robot.log[-1] == "brake"
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf, 1e30, -0.5, 1.5])
+@pytest.mark.parametrize("begin", [0.0, 0.6])
+def test_a_robot_whose_lidar_says_nonsense_does_not_drive_on(begin, value):
+    def sees(frame: SensorFrame) -> SensorFrame:
+        return frame if frame.stamp < begin else replace(frame, lidar=np.array([*[0.2] * 9, value]))
+
+    robot, pilot = Puck(control_period=0.02, noise=1e-3, sees=sees), Scripted()
+    result = driver_of(robot, pilot).run(GOAL)
+    assert result.reason == "fault" and result.fault.startswith("lidar says nothing usable for 0.8")
+    assert sum(result.holds.values()) == 1 and robot.log[-1] == "brake"
+    assert all(0.0 <= terms["lidar"].min() and terms["lidar"].max() <= 1.0 for terms in pilot.seen)
+
+
+@pytest.mark.parametrize("value", [math.nan, 1e6, -1e300])
+def test_a_robot_whose_joints_say_nonsense_does_not_drive_on(value):
+    def sees(frame: SensorFrame) -> SensorFrame:
+        return replace(frame, extra={"joint_sin": np.array([0.5, 0.5 if frame.stamp < 0.6 else value])})
+
+    robot, pilot = Puck(control_period=0.02, noise=1e-3, sees=sees), Scripted()
+    result = driver_of(robot, pilot).run(GOAL)
+    assert result.reason == "fault" and result.fault.startswith("joint_sin says nothing usable for 0.8")
+    assert all((terms["joint_sin"] == 0.5).all() for terms in pilot.seen)

@@ -1,4 +1,4 @@
-"""Spikes of 10 to 1000 sigma on 5 % of all samples."""
+"""Spikes of 10 to 1000 sigma on 5 % of all samples, and sensors that say nothing else."""
 
 from __future__ import annotations
 
@@ -37,3 +37,37 @@ def test_spikes_are_gated_and_the_position_error_at_most_doubles(robot, seed):
     assert sum(count for name, count in estimator.counts.items() if name.endswith("_rejected")) > 0
     assert spiked.position_rms <= 2.0 * nominal.position_rms
     assert all(estimate.trust is Trust.GOOD for estimate in spiked.estimates)
+
+
+LIES = {
+    "gyro": lambda reading, rng: reading + [0.0, 0.0, 300.0],
+    "gyro, scattered": lambda reading, rng: rng.uniform(-90.0, 90.0, 3),
+    "magnetometer": lambda reading, rng: 1.5 * reading,
+    "velocimeter": lambda reading, rng: rng.uniform(-40.0, 40.0, 3),
+    "position_fix": lambda reading, rng: reading + rng.uniform(-30.0, 30.0, 2),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_sensor_whose_every_reading_is_rejected_is_as_good_as_silent(lie):
+    motion, rng, sensor = recorded("point"), np.random.default_rng(0), lie.partition(",")[0]
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        reading = getattr(frame, sensor)
+        return frame if frame.stamp < 1.5 or reading is None else replace(frame, **{sensor: LIES[lie](reading, rng)})
+
+    estimator = estimator_for(motion)
+    errors = follow(motion, estimator, frames(motion), damage)
+    config = estimator.config
+    hold, lost = (
+        (config.fix_hold_after, config.fix_lost_after)
+        if sensor == "position_fix"
+        else (config.hold_after, config.lost_after)
+    )
+    assert estimator.counts[f"{sensor}_rejected"] >= (10 if sensor == "position_fix" else 70)
+    held = [each for each in errors.estimates if each.trust is not Trust.GOOD]
+    assert all(each.why.startswith(f"{sensor} says nothing usable") for each in held)
+    # a scattered lie may by chance be close to the truth
+    slack = 0.2 if "scattered" in lie or sensor in ("position_fix", "velocimeter") else 0.03
+    assert 1.5 + hold - 0.11 < held[0].stamp < 1.5 + hold + slack
+    assert (held[-1].trust is Trust.LOST) == (1.5 + lost < motion.stamps[-1]) and held[-1] is errors.estimates[-1]
