@@ -159,7 +159,7 @@ class Replay:
         if tick.sent is not None and tick.proposed is not None:
             yield "sent", tick.sent, self._guarded(tick, tick.proposed)
         elif tick.sent is None:
-            self._guard.braked()
+            self._guard.braked(None if tick.estimate is None else tick.estimate.upright)
 
     def _guarded(self, tick: TickRecord, proposed: np.ndarray) -> np.ndarray:
         estimate = tick.estimate

@@ -283,7 +283,8 @@ def test_a_service_gives_the_first_fix_its_time_from_the_goal_on():
     assert driver.last_result is not None and driver.last_result.reached and Mode.FAULT not in modes
     robot.sees = without_fix_before(7.5 + robot.stamp)
     driver.serve()
-    assert driver.supervisor.mode is Mode.FAULT and driver.supervisor.fault == "no position and heading for 2.10 s"
+    assert driver.supervisor.mode is Mode.FAULT
+    assert driver.supervisor.fault == "no position and heading for 2.10 s (position_fix: silent)"
 
 
 @pytest.mark.parametrize("reason", ["goal", "cancelled"])
