@@ -24,7 +24,7 @@ from hiernav.reproduce.results import (
     this_machine,
     write_result,
 )
-from hiernav.reproduce.work import Outcome, Report, trained_seconds
+from hiernav.reproduce.work import Outcome, Report, is_trained_here, trained_seconds
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
 """`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
@@ -240,8 +240,15 @@ class Queue:
         """Why a cell cannot be started, if so."""
         known = {each.id: each for each in self.cells}
         for need in cell.needs:
-            if need in known and (state := look_up(known[need], self.places).state) != "done":
+            if need not in known:
+                continue
+            if (state := look_up(known[need], self.places).state) != "done":
                 return f"needs {need}, which is {state}"
+            if cell.run is not None and known[need].run == cell.run and not is_trained_here(known[need], self.places):
+                return (
+                    f"needs {need}, which was trained elsewhere: copy its run folder to {self.places.runs / cell.run}, "
+                    "or remove its result, so that it is trained here"
+                )
         if left is not None and (estimate := self.estimate(cell)) > left:
             return f"takes about {duration(estimate)}, and {duration(max(left, 0.0))} are left"
         return None

@@ -70,6 +70,15 @@ def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
     return places.runs / cell.run, ("planner", "skill") if stage == "all" else (stage,)
 
 
+def is_trained_here(cell: Cell, places: Places) -> bool:
+    """Whether the run folder of a training holds what it trained: of one that was made elsewhere only its result came.
+
+    True for cells that train nothing.
+    """
+    folder, stages = training_of(cell, places)
+    return all((folder / stage / "checkpoint.pt").is_file() for stage in stages)
+
+
 def trained_seconds(cell: Cell, places: Places) -> float:
     """What the training of a cell has taken so far, as its run folder tells."""
     folder, stages = training_of(cell, places)

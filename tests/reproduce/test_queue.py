@@ -90,6 +90,21 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(places):
     assert {entry.state for entry in queue.entries()} == {"done"}
 
 
+def test_what_drives_a_training_that_was_made_elsewhere_waits_for_its_run_folder(places):
+    training = cell("t", kind="train", run="t-0", settings={"stage": "skill"})
+    drive = cell("d", run="t-0", needs=(training.id,))
+    compared = cell("c", kind="train", run="c-0", settings={"stage": "skill"}, needs=(training.id,))
+    Queue([training], places, Work()).run()
+    queue = Queue([training, drive, compared], places, work := Work())
+    tally = queue.run()
+    assert work.calls == ["c"], "a training that is only compared with another needs no more than its result"
+    assert "needs astar/t, which was trained elsewhere" in tally.skipped[drive.id]
+    assert str(places.runs / "t-0") in tally.skipped[drive.id] and read_result(places.results, drive.id) is None
+    (places.runs / "t-0" / "skill").mkdir(parents=True)
+    (places.runs / "t-0" / "skill" / "checkpoint.pt").touch()
+    assert queue.run().done == [drive.id]
+
+
 def test_no_cell_is_started_that_does_not_fit_into_the_budget(places):
     work = Work()
     tally = Queue([cell("long", 1e6), cell("short", 50.0)], places, work).run(budget=100.0)
