@@ -15,6 +15,7 @@ from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
 from hiernav.reproduce.results import (
+    Code,
     Machine,
     Result,
     ResultError,
@@ -28,7 +29,7 @@ from hiernav.reproduce.work import Outcome, Report, is_trained_here, trained_sec
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
 """`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
-Execute = Callable[[Cell, Places, Report], Outcome]
+Execute = Callable[[Cell, Places, Report, Code], Outcome]
 
 
 @dataclass(frozen=True)
@@ -187,11 +188,11 @@ class Queue:
 
     def _run(self, cell: Cell, watcher: Watcher, tally: Tally) -> None:
         key, started, began = cell_key(cell, self.places), time.strftime("%Y-%m-%dT%H:%M:%S%z"), time.monotonic()
-        trained_before, (commit, dirty) = trained_seconds(cell, self.places), self._code()
+        trained_before, code = trained_seconds(cell, self.places), self._code()
         watcher.began(cell, self.estimate(cell))
         outcome, error = Outcome({}, {}, dict(cell.settings)), None
         try:
-            outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what))
+            outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what), code)
         except CellFailed as failure:
             error = str(failure)
         seconds = trained_before + time.monotonic() - began
@@ -211,8 +212,8 @@ class Queue:
             command=cell.command,
             settings=outcome.settings,
             source=outcome.source,
-            commit=commit,
-            dirty=dirty,
+            commit=code[0],
+            dirty=code[1],
             started=started,
             seconds=round(seconds, 1),
             machine=self._machine,
@@ -228,7 +229,7 @@ class Queue:
             tally.failed[cell.id] = error
         watcher.ended(cell, result, None)
 
-    def _code(self) -> tuple[str | None, bool | None]:
+    def _code(self) -> Code:
         """Commit of a cell that starts now, and whether it runs other code: what drives was loaded with the queue, what
         trains is read when a cell starts."""
         commit, dirty = git_state(self.places.root, self.places.results)

@@ -15,6 +15,9 @@ import msgspec
 from hiernav import __version__
 from hiernav.run import write_atomically
 
+Code = tuple[str | None, bool | None]
+"""What a process runs: the commit, and whether it is other code than that; None and None where there is no git."""
+
 _PACKAGES = ("numpy", "mujoco", "onnxruntime", "torch", "torchrl")
 
 
@@ -224,7 +227,7 @@ def this_machine() -> Machine:
     return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions, gpu=_gpu())
 
 
-def git_state(root: Path, results: Path) -> tuple[str | None, bool | None]:
+def git_state(root: Path, results: Path) -> Code:
     """Commit of a repository and whether tracked files differ from it, results apart; None and None without git."""
     folders = {root / "results", results}
     excluded = [f":(exclude){folder.relative_to(root)}" for folder in folders if folder.is_relative_to(root)]

@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from hiernav.config import OptionConfig, RewardConfig, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
-from hiernav.reproduce.cells import Cell, Places, bundle_hashes, cell_key
+from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key
 from hiernav.reproduce.experiments import differences
-from hiernav.reproduce.results import git_state
+from hiernav.reproduce.results import Code
 from hiernav.run import spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
@@ -46,16 +47,22 @@ class Outcome:
     curves: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
 
 
-def run_cell(cell: Cell, places: Places, report: Report) -> Outcome:
-    """Do the work of a cell whose needs are met; a training goes on from its last checkpoint."""
-    return {
+def run_cell(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
+    """Do the work of a cell whose needs are met; a training goes on from its last checkpoint.
+
+    Args:
+        code: what this process runs, for a training to note. It is not asked of git here: what the process was forked
+            from had loaded its modules before, and a commit may have come since.
+    """
+    works: dict[Kind, Callable[[Cell, Places, Report], Outcome]] = {
         "evaluate": _evaluate,
-        "finetune": _fine_tune,
-        "train": _train,
-        "table2": _table2,
+        "finetune": partial(_fine_tune, code=code),
+        "train": partial(_train, code=code),
+        "table2": partial(_table2, code=code),
         "walk": _walk,
         "film": _film,
-    }[cell.kind](cell, places, report)
+    }
+    return works[cell.kind](cell, places, report)
 
 
 def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
@@ -85,14 +92,14 @@ def trained_seconds(cell: Cell, places: Places) -> float:
     return sum(spent_seconds(folder, stage) for stage in stages)
 
 
-def _noting_commit(folder: Path, places: Places, report: Report) -> Report:
+def _noting_commit(folder: Path, code: Code, report: Report) -> Report:
     """`report`, which before it first says something of a training notes in the run folder what trains there."""
     noted = False
 
     def note(share: float, what: str) -> None:
         nonlocal noted
         if not noted:
-            commit, dirty = git_state(places.root, places.results)
+            commit, dirty = code
             with (folder / _COMMITS).open("a") as file:
                 file.write(f"{commit or 'no repository'}{' with changes' if dirty else ''}\n")
             noted = True
@@ -188,7 +195,7 @@ def _evaluate(cell: Cell, places: Places, report: Report) -> Outcome:
     return Outcome(driven(open_policies(folder), cell.world, cell.settings, report), source, cell.settings)
 
 
-def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
+def _fine_tune(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     """Fine-tune the planner on the cell's world, then drive there."""
     from hiernav.finetune import begin_fine_tuning, fine_tuning_config
 
@@ -199,12 +206,12 @@ def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
         shutil.rmtree(folder, ignore_errors=True)  # begun by an older version and killed: nothing to go on with
         overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
-    _train_run(folder, "planner", _noting_commit(folder, places, report))
+    _train_run(folder, "planner", _noting_commit(folder, code, report))
     metrics = driven(open_policies(folder), cell.world, cell.settings, report)
     return Outcome(metrics, {**about, "fine_tuned": folder.name, "commits": _commits(folder)}, cell.settings)
 
 
-def _train(cell: Cell, places: Places, report: Report) -> Outcome:
+def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     """Train the skill, then drive with A* plans; or train the planner of a run whose skill is trained."""
     from hiernav.run import Run
 
@@ -215,7 +222,7 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
         given = folder / "given.yaml"
         given.write_text(cell.config)
         Run.create(load_config(given, [f"run_dir={folder}"])).close()
-    _train_run(folder, stage, _noting_commit(folder, places, report))
+    _train_run(folder, stage, _noting_commit(folder, code, report))
     if stage == "planner":
         curves = {"planner": _curve(folder, "planner")}
         metrics: dict[str, Any] = {"last": curves["planner"][-1]}
@@ -231,13 +238,13 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
     return Outcome(metrics, source, {**cell.settings, **differences(Run.open(folder).config)}, curves)
 
 
-def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
+def _table2(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     from hiernav.planner.table import measure
 
     assert cell.world is not None and cell.seed is not None
     wanted = cell.settings
     folder, (run, _) = places.runs / "table2", training_of(cell, places)
-    tell = _noting_commit(run, places, report)
+    tell = _noting_commit(run, code, report)
 
     def show(what: str, done: int, total: int) -> None:
         tell(done / total, f"{what}: {done:,} of {total:,}")

@@ -45,7 +45,7 @@ class Work:
     def __init__(self, **errors: BaseException) -> None:
         self.errors, self.calls = errors, []
 
-    def __call__(self, cell, places, report):
+    def __call__(self, cell, places, report, code):
         self.calls.append(cell.name)
         report(0.5, "half of it")
         if cell.name in self.errors:
@@ -150,7 +150,7 @@ def test_a_result_has_the_commit_at_which_its_cell_started(places):
     commits = [commit("hiernav/code.py")]
     following = {"a": "docs/text.md", "b": "hiernav/code.py"}
 
-    def work(cell, places, report):
+    def work(cell, places, report, code):
         if cell.name in following:
             commits.append(commit(following[cell.name]))
         return Outcome({"strict": DRIVE}, {})
@@ -162,6 +162,20 @@ def test_a_result_has_the_commit_at_which_its_cell_started(places):
         (commits[1], False),
         (commits[2], True),  # some of it was loaded before
     ]
+
+
+def test_a_training_is_told_the_code_that_its_result_names(places, monkeypatch):
+    told = []
+
+    def work(cell, places, report, code):
+        told.append(code)
+        return Outcome({"strict": DRIVE}, {})
+
+    queue = Queue([cell("a")], places, work)
+    monkeypatch.setattr(Queue, "_code", lambda _: ("abc", True))
+    queue.run()
+    result = read_result(places.results, "astar/a")
+    assert told == [("abc", True)] == [(result.commit, result.dirty)]
 
 
 def test_a_training_that_went_on_took_what_all_its_processes_took(places):
@@ -214,7 +228,7 @@ def test_another_bundle_makes_its_cells_open_again(places):
 def test_a_bundle_that_is_replaced_during_a_cell_leaves_no_result(places):
     shutil.copytree(ROOT / "deploy/bundles/point", places.root / "bundle")
 
-    def work(cell, places, report):
+    def work(cell, places, report, code):
         (places.root / "bundle" / "skill.onnx").write_bytes(b"another")
         return Outcome({}, {})
 

@@ -17,7 +17,7 @@ from hiernav.evaluate import evaluate, open_policies
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed, run_in_process
 from hiernav.reproduce.experiments import SMOKE, catalogue
-from hiernav.reproduce.results import git_state, read_result, read_results
+from hiernav.reproduce.results import read_result, read_results
 from hiernav.reproduce.work import driven, run_cell, trained_seconds
 from hiernav.sim.layout import parse_world
 
@@ -78,13 +78,12 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_cell(cell, places, stop)
+        run_cell(cell, places, stop, ("abc", False))
     capsys.readouterr()
-    outcome = run_cell(cell, places, lambda *_: None)
+    outcome = run_cell(cell, places, lambda *_: None, ("def", True))
     assert "going on after step 128 of 384" in capsys.readouterr().out
     assert [point["step"] for point in outcome.curves["evaluation"]] == [128, 256, 384]
-    (commit,) = outcome.source["commits"]  # both processes ran the same code
-    assert commit.removesuffix(" with changes") == str(git_state(ROOT, places.results)[0] or "no repository")
+    assert outcome.source["commits"] == ["abc", "def with changes"], "what the queue says that they ran"
     first, *_, last = [json.loads(line)["seconds"] for line in (places.runs / cell.run / "rates.jsonl").open()]
     assert 0.0 < first < last <= trained_seconds(cell, places)
     assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
@@ -97,7 +96,7 @@ def test_an_error_in_a_cells_process_is_its_failure(places):
         world="gremlin", bundle="deploy/bundles/nothing", settings={"episodes": 1},
     )  # fmt: skip
     with pytest.raises(CellFailed, match="deploy/bundles/nothing"):
-        run_in_process(cell, places, lambda *_: None)
+        run_in_process(cell, places, lambda *_: None, (None, None))
     log = places.runs / "logs" / "astar-a.log"
     assert "Traceback" in log.read_text()
 
@@ -112,7 +111,7 @@ def test_a_process_that_dies_is_a_failure_that_names_the_signal(places):
         child.kill()
 
     with pytest.raises(CellFailed, match="SIGKILL"):
-        run_in_process(cell, places, kill)
+        run_in_process(cell, places, kill, (None, None))
 
 
 def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result(tmp_path):
