@@ -137,6 +137,22 @@ class Book:
             tuple(self.changed[result.id] for result in found if result.id in self.changed),
         )
 
+    def seeds(
+        self, experiment: str, variant: str, robot: str, world: str | None = None, samples: int | None = None
+    ) -> list[int]:
+        """Seeds that there are to run of a variant, and those that were run beyond them."""
+        entries: list[Cell | Result] = [*self.cells, *self.results]
+        return sorted(
+            {
+                entry.seed
+                for entry in entries
+                if (entry.experiment, entry.variant, entry.robot) == (experiment, variant, robot)
+                and world in (None, entry.world)
+                and samples in (None, entry.settings.get("samples"))
+                and entry.seed is not None
+            }
+        )
+
     def training_worlds(self, robot: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
         """Worlds that planner and skill of ours are trained in, weights left out; None if nothing tells."""
         for cell in self.cells:
