@@ -19,6 +19,7 @@ from hiernav.config import OptionConfig, RewardConfig, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
+from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key
 from hiernav.reproduce.experiments import differences
 from hiernav.reproduce.results import Code
@@ -68,7 +69,8 @@ def run_cell(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
 def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
     """Run folder that a cell trains, and the stages that it trains there; none for cells that train nothing."""
     if cell.kind == "table2":
-        return places.runs / "table2" / cell.name, ("planner",)
+        assert cell.config is not None, cell.id
+        return places.runs / "table2" / f"{cell.name}-{passes.digest(cell.config)}", ("planner",)
     if cell.kind == "finetune":
         return places.runs / f"{cell.experiment}-{cell.name}-{cell_key(cell, places)[:8]}", ("planner",)
     if cell.kind != "train" or cell.run is None:

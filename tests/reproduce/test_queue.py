@@ -6,12 +6,15 @@ import fcntl
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from hiernav.reproduce.cells import Cell, Places
+from hiernav.finetune import DEFAULTS
+from hiernav.planner import passes
+from hiernav.reproduce.cells import Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
@@ -214,6 +217,20 @@ def test_other_settings_make_a_cell_open_again(places):
     assert work.calls == ["a"] and look_up(other, places).state == "done"
     longer = msgspec.structs.replace(other, seconds=99.0)
     assert look_up(longer, places).state == "done", "an estimate is not a setting"
+
+
+def test_other_passes_or_another_fine_tuning_make_their_cells_open_again(places, monkeypatch):
+    def keys():
+        return {each.id: cell_key(each, replace(places, root=ROOT)) for each in catalogue(ROOT)}
+
+    before = keys()
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "UPDATES", 4_000)
+        changed = {name for name, key in keys().items() if key != before[name]}
+    assert changed == {name for name in before if name.startswith("table2/")} and len(changed) == 24
+    monkeypatch.setitem(DEFAULTS, "planner.epochs", "20")
+    changed = {name for name, key in keys().items() if key != before[name]}
+    assert changed == {name for name in before if "finetuned" in name} and len(changed) == 36
 
 
 def test_another_bundle_makes_its_cells_open_again(places):
