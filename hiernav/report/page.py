@@ -149,12 +149,13 @@ def _efficiency(book: Book) -> str:
         f"{r.robot} {v}, seed {r.seed}" for v in ("ours", "baseline") for r in book.group("sample_efficiency", v).failed
     ]
     return (
-        "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are seeds, "
-        "thick ones their mean. The baseline sees the goal in the place of waypoints; all else is the same, the scale "
-        "of its rewards apart, which are larger. Returns in the curves are by each one’s own reward and not to be "
-        "compared; those in the table are of both by the baseline’s, as in the paper, except that here it has terms "
-        "that the paper’s lacks: leaving the field, tilting and falling cost as well. The paper’s own curves are "
-        f"printed without numbers; its networks of Table III were trained for 3,000,000 steps.</p><p>{_RECOVERY}</p>"
+        "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are "
+        "seeds, thick ones the mean of those that are of the settings of now. The baseline sees the goal in the place "
+        "of waypoints; all else is the same, the scale of its rewards apart, which are larger. Returns in the curves "
+        "are by each one’s own reward and not to be compared; those in the table are of both by the baseline’s, as "
+        "in the paper, except that here it has terms that the paper’s lacks: leaving the field, tilting and falling "
+        "cost as well. The paper’s own curves are printed without numbers; its networks of Table III were trained for "
+        f"3,000,000 steps.</p><p>{_RECOVERY}</p>"
         + (f'<p class="short">Failed: {escape(", ".join(failed))}.</p>' if failed else "")
         + _gallery(shown)
         + "<p>In the end, 1000 strict episodes in pillar(2,2,10) with A* plans:</p>"

@@ -231,6 +231,25 @@ def test_a_curve_has_a_line_for_every_seed(book):
     assert "ours (2 seeds)" in figure and ">reach rate<" in figure
 
 
+def test_a_mean_curve_is_of_the_same_steps_and_of_the_same_settings():
+    from matplotlib.figure import Figure
+
+    from hiernav.report.figures import _draw_training
+
+    def of(seed, every, rates):
+        points = [{"step": every * (k + 1.0), "reach_rate": rate} for k, rate in enumerate(rates)]
+        return trained("point", "ours", seed, curves={"evaluation": points})
+
+    results = [of(0, 10_000, [0.0, 0.2, 0.4, 0.6]), of(1, 20_000, [0.4, 0.8]), of(2, 10_000, [1.0, 1.0, 1.0])]
+    book = Book(Path(), results, [], changed={results[2].id: "older settings"})
+    axes = Figure().add_subplot()
+    _draw_training(axes, book, "point", "reach_rate", "reach rate")
+    (mean,) = (line for line in axes.lines if line.get_linewidth() > 2)
+    assert mean.get_label() == "ours (2 seeds)"
+    assert mean.get_xdata() == pytest.approx([20, 30, 40]) and mean.get_ydata() == pytest.approx([0.3, 0.5, 0.7])
+    assert sum(line.get_alpha() == 0.35 for line in axes.lines) == 3
+
+
 def test_the_curves_are_drawn_as_a_picture_too(results, tmp_path, capsys):
     out = tmp_path / "curves.png"
     arguments = ["report", "--results", str(results), "--out", str(tmp_path / "page.html"), "--curves", str(out)]
