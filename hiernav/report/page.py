@@ -245,7 +245,12 @@ def _provenance(book: Book) -> str:
     commits = Counter(
         (result.commit or "no repository")[:10] + (" with changes" if result.dirty else "") for result in results
     )
-    machines = sorted({f"{r.machine.cpu}, {r.machine.cores} cores, {r.machine.system}" for r in results})
+    machines = sorted(
+        {
+            ", ".join([m.cpu, f"{m.cores} cores", *([m.gpu] if m.gpu else []), m.system])
+            for m in (result.machine for result in results)
+        }
+    )
     versions = sorted({json.dumps(r.machine.versions, sort_keys=True) for r in results})
     failed = [r for r in results if r.state == "failed"]
     rows = []

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
+import msgspec
+
 from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
@@ -216,7 +218,7 @@ class Queue:
             dirty=code[1],
             started=started,
             seconds=round(seconds, 1),
-            machine=self._machine,
+            machine=msgspec.structs.replace(self._machine, gpu=outcome.gpu),
             metrics=outcome.metrics,
             curves=outcome.curves,
             error=error,

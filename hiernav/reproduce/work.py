@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hiernav.config import OptionConfig, RewardConfig, load_config
+from hiernav.config import OptionConfig, RewardConfig, TrainConfig, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
@@ -46,6 +46,8 @@ class Outcome:
     source: dict[str, Any]
     settings: dict[str, Any] = field(default_factory=dict)
     curves: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
+    gpu: str | None = None
+    """That torch found, if it was of use at all."""
 
 
 def run_cell(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
@@ -63,7 +65,12 @@ def run_cell(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
         "walk": _walk,
         "film": _film,
     }
-    return works[cell.kind](cell, places, report)
+    return replace(works[cell.kind](cell, places, report), gpu=_gpu())
+
+
+def _gpu() -> str | None:
+    torch = sys.modules.get("torch")  # what drives a bundle does without
+    return torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else None
 
 
 def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
@@ -237,7 +244,19 @@ def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
         found = driven(open_policies(folder), cell.world or "", settings, report, reward)
         metrics = {"best": {key: value for key, value in best.items() if key != "seconds"}, **found}
     source = {"run": cell.run, "commits": _commits(folder)}
-    return Outcome(metrics, source, {**cell.settings, **differences(Run.open(folder).config)}, curves)
+    config = Run.open(folder).config
+    computed = {key: value for part in training_of(cell, places)[1] for key, value in _computed(config, part).items()}
+    return Outcome(metrics, source, {**cell.settings, **differences(config), **computed}, curves)
+
+
+def _computed(config: TrainConfig, stage: str) -> dict[str, str]:
+    """Device and precision that a stage is trained with in this process, "auto" resolved."""
+    from hiernav.device import choose_device, choose_precision
+
+    given = config.planner if stage == "planner" else config.skill
+    device = choose_device(given.device, f"{stage}.device")
+    precision = str(choose_precision(given.precision, device)).removeprefix("torch.")
+    return {f"{stage}.device": device.type, f"{stage}.precision": precision}
 
 
 def _table2(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:

@@ -22,7 +22,7 @@ from hiernav.film.film import film_name
 from hiernav.report import findings as told
 from hiernav.report import paper, tables
 from hiernav.report.book import Book, of_seeds
-from hiernav.report.page import FILM_LIMIT, _ablations, _film, _replanning, render, write_report
+from hiernav.report.page import FILM_LIMIT, _ablations, _film, _provenance, _replanning, render, write_report
 from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, UNSEEN, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
@@ -215,6 +215,13 @@ def test_references_inside_figures_are_to_what_is_there_once(page):
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
     assert set(re.findall(r'(?:xlink:href="#|href="#|url\(#)([^")]+)', page)) <= set(ids)
+
+
+def test_the_page_names_the_gpu_of_a_machine():
+    with_one, without = (trained("point", "ours", seed) for seed in (0, 1))
+    with_one = msgspec.structs.replace(with_one, machine=msgspec.structs.replace(with_one.machine, gpu="NVIDIA H100"))
+    told = text_of(_provenance(book_of(with_one, without)))
+    assert "Machines: abacus, 2 cores, Linux x86_64; abacus, 2 cores, NVIDIA H100, Linux x86_64." in told
 
 
 def test_every_figure_and_table_has_its_command(page):

@@ -10,15 +10,18 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hiernav.evaluate import evaluate, open_policies
+from hiernav.reproduce import queue, work
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed, run_in_process
 from hiernav.reproduce.experiments import SMOKE, catalogue
+from hiernav.reproduce.queue import Queue
 from hiernav.reproduce.results import read_result, read_results
-from hiernav.reproduce.work import driven, run_cell, trained_seconds
+from hiernav.reproduce.work import Outcome, driven, run_cell, trained_seconds
 from hiernav.sim.layout import parse_world
 
 ROOT = Path(__file__).parents[2]
@@ -86,8 +89,22 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
     assert outcome.source["commits"] == ["abc", "def with changes"], "what the queue says that they ran"
     first, *_, last = [json.loads(line)["seconds"] for line in (places.runs / cell.run / "rates.jsonl").open()]
     assert 0.0 < first < last <= trained_seconds(cell, places)
+    assert outcome.settings["skill.device"] in ("cpu", "cuda")
+    assert outcome.settings["skill.precision"] in ("float32", "bfloat16")
     assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
+
+
+@pytest.mark.parametrize("gpu", ["NVIDIA H100", None])
+def test_a_gpu_is_told_by_the_process_that_computes_if_torch_sees_one_there(places, monkeypatch, gpu):
+    cuda = SimpleNamespace(is_available=lambda: gpu is not None, get_device_name=lambda: gpu)
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=cuda))
+    monkeypatch.setattr(work, "_walk", lambda *_: Outcome({}, {}))
+    cell = next(each for each in catalogue(ROOT) if each.kind == "walk")
+    written = []
+    monkeypatch.setattr(queue, "write_result", lambda _, result: written.append(result))
+    Queue([cell], places, run_cell).run()
+    assert [result.machine.gpu for result in written] == [gpu]
 
 
 def test_an_error_in_a_cells_process_is_its_failure(places):
