@@ -159,7 +159,10 @@ class Queue:
 
     def left(self, retry: bool = False) -> list[Cell]:
         """Cells that a run would start, those included that wait for others."""
-        return [e.cell for e in self.entries() if not e.settled or (retry and e.state != "done")]
+        return [entry.cell for entry in self._unsettled(retry)]
+
+    def _unsettled(self, retry: bool) -> list[Entry]:
+        return [entry for entry in self.entries() if not entry.settled or (retry and entry.state != "done")]
 
     def run(self, budget: float | None = None, retry: bool = False, watcher: Watcher | None = None) -> Tally:
         """Run what is left. Stopping it at any time, with Ctrl-C or SIGTERM, loses an evaluation at most.
@@ -171,14 +174,15 @@ class Queue:
         watcher, tally = watcher or Watcher(), Tally()
         began = time.monotonic()
         try:
-            for cell in self.left(retry):
+            for before in self._unsettled(retry):
+                cell = before.cell
                 why = self._why_not(cell, None if budget is None else budget - (time.monotonic() - began))
                 if why is None:
                     with _claimed(cell, self.places) as mine:
                         if not mine:
                             why = "another queue runs it"
-                        elif look_up(cell, self.places).state == "done":
-                            why = "another queue has run it"
+                        elif (now := look_up(cell, self.places)).settled and now != before:
+                            why = f"another queue has run it: {now.state}"
                         else:
                             self._run(cell, watcher, tally)
                 if why is not None:

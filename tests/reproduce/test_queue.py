@@ -264,6 +264,23 @@ def test_two_queues_do_not_work_on_the_same_cell(places):
     assert work.calls == ["b"] and "another queue" in tally.skipped["astar/a"]
 
 
+@pytest.mark.parametrize("retry", [False, True])
+def test_what_another_queue_has_failed_at_meanwhile_is_not_tried_again(places, retry):
+    cells = [cell("a"), cell("b"), cell("c")]
+    Queue(cells[1:2], places, Work(b=CellFailed("before"))).run()
+    calls = []
+
+    def work(cell, places, report, code):
+        calls.append(cell.name)
+        if cell.name == "a":
+            Queue(cells[1:], places, Work(b=CellFailed("again"), c=CellFailed("too"))).run(retry=retry)
+        raise CellFailed("too")
+
+    tally = Queue(cells, places, work).run(retry=True)
+    assert calls == (["a"] if retry else ["a", "b"]), "b was not retried by the other queue, and is by this one"
+    assert tally.skipped["astar/c"] == "another queue has run it: failed"
+
+
 @pytest.mark.parametrize(
     ("damage", "part"),
     [
