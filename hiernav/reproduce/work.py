@@ -213,7 +213,7 @@ def _fine_tune(cell: Cell, places: Places, report: Report, code: Code) -> Outcom
     folder, _ = training_of(cell, places)
     if not (folder / "skill" / "checkpoint.pt").exists():
         shutil.rmtree(folder, ignore_errors=True)  # begun by an older version and killed: nothing to go on with
-        overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
+        overrides = [f"planner.worlds={json.dumps([cell.world])}", _run_dir(folder), f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
     _train_run(folder, "planner", _noting_commit(folder, code, report))
     metrics = driven(open_policies(folder), cell.world, cell.settings, report)
@@ -230,7 +230,7 @@ def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
         folder.mkdir(parents=True, exist_ok=True)
         given = folder / "given.yaml"
         given.write_text(cell.config)
-        Run.create(load_config(given, [f"run_dir={folder}"])).close()
+        Run.create(load_config(given, [_run_dir(folder)])).close()
     _train_run(folder, stage, _noting_commit(folder, code, report))
     if stage == "planner":
         curves = {"planner": _curve(folder, "planner")}
@@ -306,6 +306,11 @@ def _film(cell: Cell, places: Places, report: Report) -> Outcome:
     )
     metrics = {"file": file.name, "bytes": file.stat().st_size, "reached": sum(e.reached for e in episodes)}
     return Outcome(metrics, source, cell.settings)
+
+
+def _run_dir(folder: Path) -> str:
+    """The setting, for a path that YAML could take for something else too: "~/a", "a #1", "[x]"."""
+    return f"run_dir={json.dumps(str(folder))}"
 
 
 def _train_run(folder: Path, stage: str, report: Report) -> None:

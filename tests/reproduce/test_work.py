@@ -73,6 +73,7 @@ def test_a_fixed_period_is_what_lies_between_plans():
 
 @pytest.mark.train
 def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys):
+    places = replace(places, runs=places.runs / "#1 [x]: y")  # YAML would read it otherwise
     size = replace(SMOKE, training=(*SMOKE.training, "skill.num_envs=1", "skill.total_steps=384"))
     cell = next(c for c in catalogue(ROOT, size, 1, ["point"]) if c.id == "sample_efficiency/point-ours-0")
 
