@@ -28,6 +28,7 @@ from hiernav.reproduce.results import (
     write_result,
 )
 from hiernav.reproduce.work import Outcome, Report, is_trained_here, trained_seconds
+from hiernav.run import RunError
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
 """`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
@@ -124,9 +125,10 @@ class Estimates:
             result = entry.result
             if result is None or entry.state != "done":
                 continue
+            spent = _spent(entry.cell, places)
             here = (result.machine.cpu, result.machine.cores) == (machine.cpu, machine.cores)
             # one that took less than its training did counts the last process of several alone
-            if here and result.seconds >= trained_seconds(entry.cell, places):
+            if here and spent is not None and result.seconds >= spent:
                 self.learn(entry.cell, result.seconds)
 
     def learn(self, cell: Cell, seconds: float) -> None:
@@ -168,7 +170,8 @@ class Queue:
         """Run what is left. Stopping it at any time, with Ctrl-C or SIGTERM, loses an evaluation at most.
 
         Args:
-            budget: seconds; no cell is started whose estimate does not fit into what is left of them.
+            budget: seconds; no cell is started whose estimate, less what its training has taken before, does not fit
+                into what is left of them.
             retry: whether to run failed cells again, and those whose result file is damaged.
         """
         watcher, tally = watcher or Watcher(), Tally()
@@ -194,7 +197,7 @@ class Queue:
 
     def _run(self, cell: Cell, watcher: Watcher, tally: Tally) -> None:
         key, started, began = cell_key(cell, self.places), time.strftime("%Y-%m-%dT%H:%M:%S%z"), time.monotonic()
-        trained_before, code = trained_seconds(cell, self.places), self._code()
+        trained_before, code = _spent(cell, self.places) or 0.0, self._code()
         watcher.began(cell, self.estimate(cell))
         outcome, error = Outcome({}, {}, dict(cell.settings)), None
         try:
@@ -256,8 +259,17 @@ class Queue:
                     f"needs {need}, which was trained elsewhere: copy its run folder to {self.places.runs / cell.run}, "
                     "or remove its result, so that it is trained here"
                 )
-        if left is not None and (estimate := self.estimate(cell)) > left:
-            return f"takes about {duration(estimate)}, and {duration(max(left, 0.0))} are left"
+        if left is None:
+            return None
+        ahead = max(self.estimate(cell) - (_spent(cell, self.places) or 0.0), 0.0)
+        return f"takes about {duration(ahead)}, and {duration(max(left, 0.0))} are left" if ahead > left else None
+
+
+def _spent(cell: Cell, places: Places) -> float | None:
+    """Seconds that a cell's training has taken so far; None where its run folder is damaged."""
+    try:
+        return trained_seconds(cell, places)
+    except RunError:
         return None
 
 

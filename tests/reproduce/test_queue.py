@@ -201,6 +201,33 @@ def test_a_training_that_went_on_took_what_all_its_processes_took(places):
     assert left_after(34.0) == 600.0, "the seconds of its last process say nothing about a training"
 
 
+def started(places: Places, seconds: float) -> Cell:
+    """A training that has taken some seconds."""
+    training = cell("t", 2400.0, kind="train", run="t-0", settings={"stage": "skill"})
+    (places.runs / "t-0").mkdir(parents=True)
+    line = {"stage": "skill", "step": 500_000, "steps_per_second": 210.0, "seconds": seconds}
+    (places.runs / "t-0" / "rates.jsonl").write_text(json.dumps(line) + "\n")
+    return training
+
+
+@pytest.mark.parametrize(("spent", "starts"), [(2350.0, True), (1000.0, False), (9000.0, True)])
+def test_a_budget_counts_what_is_left_of_a_training(places, spent, starts):
+    tally = Queue([started(places, spent)], places, Work()).run(budget=1200.0)
+    assert bool(tally.done) is starts
+    if not starts:
+        assert tally.skipped["astar/t"].startswith(f"takes about {duration(1400.0)}")
+
+
+def test_a_damaged_run_folder_ends_no_queue(places):
+    training = started(places, 100.0)
+    Queue([training], places, Work()).run()
+    (places.runs / "t-0" / "rates.jsonl").write_text("\0\0\n")
+    queue = Queue([training, cell("u", kind="train", run="t-0", settings={"stage": "skill"})], places, Work())
+    assert [entry.state for entry in queue.entries()] == ["done", "open"]
+    assert queue.estimate(training) == 2400.0
+    assert queue.run(budget=1e5).done == ["astar/u"]
+
+
 def test_estimates_follow_what_cells_of_a_kind_took(places):
     queue = Queue([cell("a", 10.0), cell("film", 10.0, kind="film")], places, Work())
     queue.estimate.learn(cell("a", 10.0), 30.0)
