@@ -62,7 +62,8 @@ def render(book: Book, beside: Path = Path()) -> str:
         "<h1>The paper, run again</h1>"
         "<p>Ota et al., <i>Efficient Exploration in Constrained Environments with Goal-Oriented Reference Path</i> "
         "(IROS 2020), and hiernav beside it. Ranges are 95 % intervals: over seeds Student’s t, over the episodes of "
-        "one policy Wilson for rates and normal for means, cut to what is possible. A collision of a robot is a "
+        "one policy Wilson for rates and normal for means, cut to what is possible; of rates over seeds at least "
+        "Wilson of all their episodes. A collision of a robot is a "
         "control step in which it touches an obstacle; there are 50 of them in a second of the point, 25 of the car "
         "and 10 of the doggo.</p>"
         f"<nav>{links}</nav>{_damaged(book)}{_older(book)}{body}</main></body></html>\n"
@@ -254,15 +255,14 @@ def _provenance(book: Book) -> str:
     versions = sorted({json.dumps(r.machine.versions, sort_keys=True) for r in results})
     failed = [r for r in results if r.state == "failed"]
     rows = []
-    planned_of = Counter(cell.experiment for cell in book.cells)
+    known = {result.id for result in results}
     for name in EXPERIMENTS:
-        planned = planned_of[name]
+        planned = [cell for cell in book.cells if cell.experiment == name]
         mine = [r for r in results if r.experiment == name]
         done, wrong = sum(r.state == "done" for r in mine), sum(r.state == "failed" for r in mine)
         hours = sum(r.seconds for r in mine) / 3600
-        rows.append(
-            [name, str(done), str(wrong), str(max(planned - len(mine), 0)) if planned else "?", f"{hours:.2f} h"]
-        )
+        missing = str(sum(cell.id not in known for cell in planned)) if planned else "?"
+        rows.append([name, str(done), str(wrong), missing, f"{hours:.2f} h"])
     parts = [
         "<p>Every number is from a file in <code>results/</code>, with its seed, commit, settings, machine, duration "
         "and the command that makes it.</p>",

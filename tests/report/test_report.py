@@ -21,7 +21,7 @@ from hiernav.evaluate import wilson_interval
 from hiernav.film.film import film_name
 from hiernav.report import findings as told
 from hiernav.report import paper, tables
-from hiernav.report.book import Book, of_seeds
+from hiernav.report.book import Book, Group, of_seeds
 from hiernav.report.page import FILM_LIMIT, _ablations, _film, _provenance, _replanning, render, write_report
 from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, UNSEEN, WORLDS
@@ -98,6 +98,38 @@ def test_walks_are_read_and_shown_for_every_world(results, book, page):
         found = read_result(results, cell.id).metrics
         assert f"{100.0 * found['verified']['repairs'] / found['verified']['proposals']:.1f} %" in page
         assert f"<td>{found['network']['collisions_mean']:.3f}</td>" in page
+
+
+def test_walks_that_failed_or_verified_nothing_have_their_row():
+    nothing, failed = (made_up.CELLS[f"walks/point-{world}"] for world in ("gremlin", "two-room"))
+    metrics = made_up.result_of(nothing).metrics
+    metrics["verified"] = {name: metrics["verified"][name] for name in ("collisions_mean", "reach_rate")}
+    shown = rows(
+        tables.walks(
+            book_of(made_up.result_of(nothing, metrics=metrics), made_up.result_of(failed, **FAILURE)), "point"
+        )
+    )
+    assert shown["gremlin"][-1] == "–" and shown["two-room"][0] == "failed"
+
+
+def test_what_was_not_run_is_counted_by_its_name():
+    planned = [f"sample_efficiency/point-ours-{seed}" for seed in range(5)]
+    first = trained("point", "ours", 0)
+    beyond = [msgspec.structs.replace(first, cell=f"point-ours-{seed}", seed=seed) for seed in range(5, 15)]
+    table = rows(_provenance(book_of(first, *beyond, planned=planned)))
+    assert table["sample_efficiency"][:3] == ["11", "0", "4"]
+
+
+@pytest.mark.parametrize("name", ["reach_rate", "collision_free_rate"])
+def test_seeds_that_agree_leave_a_rate_an_interval(name):
+    def group(*rates):
+        drives = [made_up.drive(np.random.default_rng(0), 1000) | {name: rate} for rate in rates]
+        return Group(tuple(trained("point", "ours", seed, metrics={"strict": d}) for seed, d in enumerate(drives)))
+
+    agreeing = group(1.0, 1.0, 1.0).estimate(name)
+    assert (agreeing.low, agreeing.high) == wilson_interval(3000, 3000) and agreeing.count == 3
+    apart = group(0.2, 0.9, 0.4).estimate(name)
+    assert (apart.low, apart.high) == (of_seeds([0.2, 0.9, 0.4], 0.0, 1.0).low, 1.0)
 
 
 def test_the_papers_numbers_are_there_and_belong_where_they_stand(book, page):
