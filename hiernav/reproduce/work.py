@@ -87,12 +87,16 @@ def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
 
 
 def is_trained_here(cell: Cell, places: Places) -> bool:
-    """Whether the run folder of a training holds what it trained: of one that was made elsewhere only its result came.
+    """Whether the run folder of a training holds what it trained, to its end.
 
-    True for cells that train nothing.
+    Where it was trained elsewhere its result came alone, and may have come while this place was half way with it.
     """
     folder, stages = training_of(cell, places)
-    return all((folder / stage / "checkpoint.pt").is_file() for stage in stages)
+    try:
+        ended = json.loads((folder / "summary.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return all(stage in ended and (folder / stage / "checkpoint.pt").is_file() for stage in stages)
 
 
 def trained_seconds(cell: Cell, places: Places) -> float:

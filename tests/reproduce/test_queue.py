@@ -105,6 +105,8 @@ def test_what_drives_a_training_that_was_made_elsewhere_waits_for_its_run_folder
     assert str(places.runs / "t-0") in tally.skipped[drive.id] and read_result(places.results, drive.id) is None
     (places.runs / "t-0" / "skill").mkdir(parents=True)
     (places.runs / "t-0" / "skill" / "checkpoint.pt").touch()
+    assert queue.run().skipped.keys() == {drive.id}, "a training that is half way here was driven"
+    (places.runs / "t-0" / "summary.json").write_text('{"skill": {}}')
     assert queue.run().done == [drive.id]
 
 
