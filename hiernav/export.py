@@ -5,6 +5,7 @@ Normalisation and action scaling are inside the graphs: they take raw observatio
 
 from __future__ import annotations
 
+import math
 import tempfile
 from pathlib import Path
 
@@ -66,7 +67,8 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
             fails or is interrupted leaves the old one in its place.
 
     Raises:
-        RunError: the run has no trained planner or skill, or `out` holds anything but a bundle.
+        RunError: the run has no trained planner or skill, its planner's training was stopped early, or `out` holds
+            anything but a bundle.
         OSError: the bundle cannot be written.
     """
     run, out = Run.open(run_path), Path(out)
@@ -77,6 +79,12 @@ def export_run(run_path: str | Path, out: str | Path) -> Path:
     for stage, state in states.items():
         if state is None:
             raise RunError(f"{run.path} has no trained {stage} yet: go on with `hiernav train --resume {run.path}`")
+    epoch, epochs = states["planner"]["epoch"], run.config.planner.epochs  # type: ignore[index]
+    if epoch < epochs:
+        raise RunError(
+            f"the planner of {run.path} is trained for {epoch} of {epochs} epochs: go on with "
+            f"`hiernav train --resume {run.path} --stage planner`"
+        )
     network = load_network(run.config, states["planner"])  # type: ignore[arg-type]
     actor = load_actor(run.config, states["skill"])  # type: ignore[arg-type]
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -224,7 +232,7 @@ def _fields(layout: ObservationLayout) -> tuple[ObservationField, ...]:
 
 def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
     skill = kept(states["skill"]["evaluations"], run.config.skill.eval_episodes)
-    return {
+    values = {
         "hiernav": __version__,
         "torch": torch.__version__.split("+")[0],
         "seed": run.config.seed,
@@ -235,3 +243,4 @@ def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
         "planner_epochs": int(states["planner"]["epoch"]),
         "planner_error_m": round(float(states["planner"]["validation"].get("error", float("nan"))), 5),
     }
+    return {name: value for name, value in values.items() if not isinstance(value, float) or math.isfinite(value)}

@@ -296,6 +296,26 @@ def test_a_run_that_lacks_a_stage_is_refused_with_a_hint_and_writes_nothing(able
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_a_planner_that_was_stopped_early_is_refused_with_how_to_go_on(able_run, tmp_path):
+    run = Run.open(shutil.copytree(able_run, tmp_path / "run"))
+    run.save("planner", {**run.load("planner"), "epoch": 1})
+    run.close()
+    hint = f"is trained for 1 of 2 epochs: go on with `hiernav train --resume {run.path} --stage planner`"
+    with pytest.raises(RunError, match=hint):
+        export_run(run.path, tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_what_is_not_known_of_a_skill_is_left_out_of_the_manifest(able_run, tmp_path):
+    run = Run.open(shutil.copytree(able_run, tmp_path / "run"))
+    skill = run.load("skill")
+    run.save("skill", {**skill, "evaluations": [skill["evaluations"][-1] | {"reach_rate": float("nan")}]})
+    run.close()
+    provenance = load_bundle(export_run(run.path, tmp_path / "bundle")).manifest.provenance
+    assert "skill_reach_rate" not in provenance and provenance["skill_steps"] == 768
+    assert "NaN" not in (tmp_path / "bundle" / "manifest.json").read_text()
+
+
 def test_a_skill_without_an_evaluation_is_refused(able_run, tmp_path):
     run = Run.open(shutil.copytree(able_run, tmp_path / "run"))
     run.save("skill", {**run.load("skill"), "best_actor": None, "evaluations": []})

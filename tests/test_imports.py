@@ -34,7 +34,7 @@ ALLOWED = {
     "export": {"nav", "sim", "planner", "skill", "runtime", "config", "run"},
     "draw": {"nav", "sim"},
     "film": {"nav", "sim", "evaluate", "draw"},
-    "reproduce": {"nav", "sim", "planner", "evaluate", "finetune", "training", "film", "config", "run"},
+    "reproduce": {"nav", "sim", "planner", "evaluate", "finetune", "training", "film", "config", "run", "device"},
     "report": {"evaluate", "reproduce", "run", "sim"},
     "cli": {
         "nav",

@@ -78,6 +78,13 @@ def test_robots_have_results_of_their_own(tool, tmp_path, monkeypatch):
     assert files == [Path("runs/noise_table-point.json"), Path("runs/noise_table-car.json")]
 
 
+def test_a_robot_that_stood_still_was_not_free_of_collisions(tool):
+    stood = {"reached": False, "reason": "timeout", "steps": 300, "collisions": 0}
+    won = {**stood, "reached": True, "reason": "goal", "steps": 90}
+    found = tool._summary({"0": stood, "1": won, "2": won, "3": {**won, "collisions": 2}})
+    assert found["collision_free"] == 0.5 and found["reach"] == 0.75
+
+
 def test_what_was_driven_is_not_driven_again_and_not_mixed_with_another_bundles(tool, tmp_path, monkeypatch, capsys):
     out = tmp_path / "table.json"
     done = {case.name: {"case": {}, "worlds": {"0": {

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -32,3 +36,63 @@ def test_bad_input_is_one_line(command, line):
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
+
+
+def tool(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("options", "there"),
+    [
+        (["--world", "two-room"], "world pillar(2,2,10)"),
+        (["--episodes", "40"], "episodes 1000"),
+        (["--robot", "car"], "robot point"),
+        (["--set", "planner.epochs=3"], "settings []"),
+    ],
+)
+def test_a_table_of_planners_holds_results_of_one_kind(tmp_path, monkeypatch, capsys, options, there):
+    planner_table = tool("planner_table")
+    entry = {
+        "samples": 1000, "preset": "paper", "seed": 0, "world": "pillar(2,2,10)", "robot": "point", "episodes": 1000,
+        "settings": [], "collisions_mean": 3.0, "reach_rate": 1.0,
+    }  # fmt: skip
+    (tmp_path / "table.json").write_text(json.dumps({"paper-1000-0": entry}))
+    command = ["planner_table.py", "--out", str(tmp_path), "--only-print"]
+    monkeypatch.setattr(sys, "argv", command)
+    assert planner_table.main() == 0 and "3.000 (1)" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [*command, *options])
+    with pytest.raises(ValueError, match=re.escape(f"paper-1000-0 is of {there}; choose another --out")):
+        planner_table.main()
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("contender", ["hiernav", "float32", "torchrl"])
+def test_all_contenders_of_a_race_update_on_the_processor(monkeypatch, contender):
+    import torch
+
+    import hiernav.skill.train as skill_train
+
+    race, made = tool("training_race"), []
+
+    class Stop(Exception):
+        pass
+
+    def trainer(config, run):
+        made.append(config)
+        raise Stop
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(skill_train, "SkillTrainer", trainer)
+    monkeypatch.setattr(
+        skill_train, "make_learner", skill_train.make_learner
+    )  # put back, whatever a contender makes of it
+    arguments = SimpleNamespace(
+        train=contender, config=ROOT / "configs/point.yaml", every=100, reach=0.9, settings=["skill.device=auto"]
+    )
+    with pytest.raises(Stop):
+        race._train(arguments)
+    assert [config.skill.device for config in made] == ["cpu"]

@@ -318,7 +318,7 @@ def _summary(worlds: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "reach": reached / len(outcomes),
         "reach_95": wilson_interval(reached, len(outcomes)),
         "collisions": float(np.mean([each["collisions"] for each in outcomes])),
-        "collision_free": float(np.mean([each["collisions"] == 0 for each in outcomes])),
+        "collision_free": float(np.mean([each["reached"] and each["collisions"] == 0 for each in outcomes])),
         "steps": float(np.mean([each["steps"] for each in outcomes if each["reached"]])) if reached else None,
         "ends": dict(Counter(each["reason"] for each in outcomes)),
     }

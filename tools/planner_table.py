@@ -8,7 +8,8 @@ it has never seen: five waypoints, a new plan, and so on; every waypoint that to
     python tools/planner_table.py --out runs/planner_table --samples 1000 --seeds 0         # a part of it
     python tools/planner_table.py --out runs/planner_table --only-print                     # what there is so far
 
-Stop it at any time: the same command goes on. Results are in OUT/table.json, one entry per combination.
+Stop it at any time: the same command goes on. Results are in OUT/table.json, one entry per combination, all of one
+world, robot, number of walks and settings; others need another OUT.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ def main() -> int:
     parser.add_argument("--only-print", action="store_true", help="train nothing")
     arguments = parser.parse_args()
     results = _read(arguments.out / "table.json")
+    _require_same(arguments, results)
     queue = [
         (samples, preset, seed)
         for samples in sorted(arguments.samples)
@@ -124,6 +126,17 @@ def _print(results: dict[str, dict[str, Any]]) -> None:
 
 def _read(file: Path) -> dict[str, Any]:
     return json.loads(file.read_text()) if file.exists() else {}
+
+
+def _require_same(arguments: argparse.Namespace, results: dict[str, Any]) -> None:
+    """Raise if there are results that would stand in the table beside others than their own kind."""
+    wanted = {
+        "world": arguments.world, "robot": arguments.robot, "episodes": arguments.episodes, "settings": arguments.set,
+    }  # fmt: skip
+    for name, result in results.items():
+        if different := [key for key, value in wanted.items() if result.get(key) != value]:
+            there = ", ".join(f"{key} {result.get(key)}" for key in different)
+            raise ValueError(f"{arguments.out / 'table.json'}: {name} is of {there}; choose another --out")
 
 
 def _write(file: Path, results: dict[str, Any]) -> None:

@@ -9,7 +9,8 @@ The same training with the same seed, one after the other, each in a process of 
     float32    the same with all products in float32
     torchrl    SACLoss, SoftUpdate and torch's Adam as they come, eager
 
-Time runs from the first step, without the evaluations, which cost all of them the same. Close other programs.
+All update on the processor, whatever else there is. Time runs from the first step, without the evaluations, which cost
+all of them the same. Close other programs.
 """
 
 from __future__ import annotations
@@ -91,13 +92,14 @@ def _train(arguments: argparse.Namespace) -> None:
     settings = [
         f"skill.eval_every_steps={arguments.every}", f"skill.eval_episodes={EPISODES}",
         f"skill.stop_reach_rate={arguments.reach}", *arguments.settings,
+        "skill.device=cpu",  # torchrl's losses as they come know no other here
     ]  # fmt: skip
     if arguments.train == "float32":
         settings.append("skill.precision=float32")
     if arguments.train == "torchrl":
         skill_train.make_learner = torchrl_learner
     with tempfile.TemporaryDirectory(prefix="hiernav-race-") as folder:
-        config = load_config(arguments.config, [*settings, f"run_dir={folder}/run"])
+        config = load_config(arguments.config, [*settings, f"run_dir={json.dumps(f'{folder}/run')}"])
         torch.set_num_threads(config.threads)
         trainer = skill_train.SkillTrainer(config, Run.create(config))
         evaluate, began, outside = trainer._evaluate, time.perf_counter(), 0.0

@@ -1,6 +1,14 @@
-"""How long planners of Table II are trained, whatever the size of their data set; known without torch."""
+"""How planners of Table II are trained, and how long whatever the size of their data set; known without torch."""
 
 from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+
+import msgspec
+
+from hiernav.config import TrainConfig, load_config
 
 BATCH, UPDATES, EPOCHS = 256, 1_000, 6
 """Every set is seen six times, and small ones until there were 1,000 updates."""
@@ -14,3 +22,33 @@ def epochs(samples: int) -> int:
 def updates(samples: int) -> int:
     """Gradient updates in all of them."""
     return epochs(samples) * -(-samples // BATCH)
+
+
+def configuration(
+    samples: int, preset: str, seed: int, world: str, robot: str = "point", settings: Sequence[str] = ()
+) -> TrainConfig:
+    """Of the training of an entry of Table II, its folders apart; `settings` are laid over all others."""
+    return load_config(
+        None,
+        [
+            f"robot={robot}",
+            f"seed={seed}",
+            f"planner.preset={preset}",
+            f"planner.samples={samples}",
+            f"planner.worlds={json.dumps([world])}",
+            f"planner.epochs={epochs(samples)}",
+            f"planner.batch_size={BATCH}",
+            *settings,
+        ],
+    )
+
+
+def what_decides(config: TrainConfig) -> str:
+    """All that decides what a planner's training comes to, its seed apart, as JSON."""
+    planner = msgspec.structs.replace(config.planner, data=None)
+    return msgspec.json.encode({"robot": config.robot, "planner": planner, "option": config.option}).decode()
+
+
+def digest(text: str) -> str:
+    """For names of folders: what differs lies apart."""
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

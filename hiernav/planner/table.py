@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from hiernav.config import load_config
 from hiernav.planner import passes
 from hiernav.planner.dataset import data_seed, label_settings
 from hiernav.planner.store import read_manifest, write_dataset
@@ -40,7 +41,8 @@ def measure(
     """Train one planner, or go on training it, and walk.
 
     Args:
-        folder: for the run and for the data set, of which smaller sizes are the first samples.
+        folder: for the run and for the data set, of which smaller sizes are the first samples; those of other settings
+            have other names there.
         preset: "paper" or "default".
         robot: whose radius the disc has.
         settings: further ones of the training.
@@ -51,26 +53,14 @@ def measure(
         if on_progress is not None:
             on_progress(what, done, total)
 
-    run_dir, data = folder / f"{preset}-{samples}-{seed}", folder / f"data-{preset}-{seed}"
-    config = load_config(
-        None,
-        [
-            f"robot={robot}",
-            f"seed={seed}",
-            f"threads={threads}",
-            f"run_dir={run_dir}",
-            f"planner.preset={preset}",
-            f"planner.samples={samples}",
-            f"planner.worlds={json.dumps([world])}",
-            f"planner.data={data}",
-            f"planner.epochs={passes.epochs(samples)}",
-            f"planner.batch_size={passes.BATCH}",
-            *settings,
-        ],
-    )
+    config = passes.configuration(samples, preset, seed, world, robot, settings)
+    made = label_settings(config)
+    run_dir = folder / f"{preset}-{samples}-{seed}-{passes.digest(passes.what_decides(config))}"
+    data = folder / f"data-{preset}-{seed}-{passes.digest(json.dumps(asdict(made)))}"
+    planner = msgspec.structs.replace(config.planner, data=str(data))
+    config = msgspec.structs.replace(config, threads=threads, run_dir=str(run_dir), planner=planner)
     run = Run.open(run_dir) if (run_dir / "config.yaml").exists() else Run.create(config)
     if not (data / "dataset.json").exists() or read_manifest(data).made < samples:
-        made = label_settings(config)
         write_dataset(data, made, samples, data_seed(config), threads, lambda done: show("data set", done, samples))
     trainer = PlannerTrainer(run.config, run)
     trainer.resume()

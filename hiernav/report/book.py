@@ -19,6 +19,8 @@ from hiernav.reproduce.results import Drive, Result, drive_of, read_results
 
 _HALF_WIDTHS = {"steps_mean": "steps_half95", "collisions_mean": "collisions_half95", "spl_mean": "spl_half95"}
 
+_RATES = ("reach_rate", "collision_free_rate")
+"""Shares of episodes."""
 _RANGES = {
     **dict.fromkeys(("reach_rate", "collision_free_rate", "spl_mean"), (0.0, 1.0)),
     **dict.fromkeys(("steps_mean", "collisions_mean", "steps_between_plans"), (0.0, math.inf)),
@@ -56,12 +58,18 @@ class Group:
         """Of a number of `Drive`: over seeds where there are several, over episodes where there is one; None: not run.
 
         Intervals: Student's t over seeds; over episodes Wilson for rates, normal for means; cut to what is possible.
+        Those of rates over seeds hold Wilson's of all episodes together: seeds that agree do not prove a number.
         """
         drives = [drive for result in self.done if (drive := drive_of(result, protocol)) is not None]
         values = [float(value) for drive in drives if (value := getattr(drive, name)) is not None]
         if len(values) == 1:
             return _of_episodes(next(d for d in drives if getattr(d, name) is not None), name)
-        return of_seeds(values, *_RANGES.get(name, _ANY))
+        found = of_seeds(values, *_RANGES.get(name, _ANY))
+        if found is None or name not in _RATES:
+            return found
+        episodes = sum(drive.episodes for drive in drives)
+        low, high = wilson_interval(round(sum(getattr(drive, name) * drive.episodes for drive in drives)), episodes)
+        return replace(found, low=min(found.low, low), high=max(found.high, high))
 
 
 def of_seeds(values: Sequence[float], least: float = -math.inf, most: float = math.inf) -> Estimate | None:
@@ -135,6 +143,22 @@ class Book:
             tuple(result for result in found if result.state == "done"),
             tuple(result for result in found if result.state == "failed"),
             tuple(self.changed[result.id] for result in found if result.id in self.changed),
+        )
+
+    def seeds(
+        self, experiment: str, variant: str, robot: str, world: str | None = None, samples: int | None = None
+    ) -> list[int]:
+        """Seeds that there are to run of a variant, and those that were run beyond them."""
+        entries: list[Cell | Result] = [*self.cells, *self.results]
+        return sorted(
+            {
+                entry.seed
+                for entry in entries
+                if (entry.experiment, entry.variant, entry.robot) == (experiment, variant, robot)
+                and world in (None, entry.world)
+                and samples in (None, entry.settings.get("samples"))
+                and entry.seed is not None
+            }
         )
 
     def training_worlds(self, robot: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,20 +87,29 @@ def save_training(book: Book, out: Path) -> None:
 
 def _draw_training(axes: Axes, book: Book, robot: str, name: str, what: str) -> None:
     for variant, color in (("ours", OURS), ("baseline", BASELINE)):
-        curves = [curve(result, name) for result in book.group("sample_efficiency", variant, robot).done]
-        for steps, values in curves:
+        results = book.group("sample_efficiency", variant, robot).done
+        for steps, values in (curve(result, name) for result in results):
             axes.plot(steps / 1e3, values, color=color, alpha=0.35, linewidth=0.9)
+        current = [curve(result, name) for result in results if result.id not in book.changed]
+        curves = [(steps, values) for steps, values in current if len(steps)]
         if curves:
-            shortest = min(len(steps) for steps, _ in curves)
-            mean = np.mean([values[:shortest] for _, values in curves], axis=0)
             label = f"{variant} ({len(curves)} {'seed' if len(curves) == 1 else 'seeds'})"
-            axes.plot(curves[0][0][:shortest] / 1e3, mean, color=color, linewidth=2.2, label=label)
+            steps, mean = mean_curve(curves)
+            axes.plot(steps / 1e3, mean, color=color, linewidth=2.2, label=label)
     if name == "reach_rate":
         axes.axhline(0.9, color=PAPER, linewidth=0.8, linestyle=":")
         axes.set_ylim(-0.02, 1.02)
     axes.set(xlabel="environment steps [thousands]", ylabel=what, title=robot)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False)
+
+
+def mean_curve(curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (T,) and mean (T,) of curves, between their evaluations on straight lines, as far as all of them go."""
+    steps = np.unique(np.concatenate([each for each, _ in curves]))
+    first, last = max(each[0] for each, _ in curves), min(each[-1] for each, _ in curves)
+    steps = steps[(steps >= first) & (steps <= last)]
+    return steps, np.mean([np.interp(steps, *each) for each in curves], axis=0)
 
 
 def reach(book: Book, robot: str) -> str | None:

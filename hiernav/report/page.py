@@ -62,7 +62,8 @@ def render(book: Book, beside: Path = Path()) -> str:
         "<h1>The paper, run again</h1>"
         "<p>Ota et al., <i>Efficient Exploration in Constrained Environments with Goal-Oriented Reference Path</i> "
         "(IROS 2020), and hiernav beside it. Ranges are 95 % intervals: over seeds Student’s t, over the episodes of "
-        "one policy Wilson for rates and normal for means, cut to what is possible. A collision of a robot is a "
+        "one policy Wilson for rates and normal for means, cut to what is possible; of rates over seeds at least "
+        "Wilson of all their episodes. A collision of a robot is a "
         "control step in which it touches an obstacle; there are 50 of them in a second of the point, 25 of the car "
         "and 10 of the doggo.</p>"
         f"<nav>{links}</nav>{_damaged(book)}{_older(book)}{body}</main></body></html>\n"
@@ -149,12 +150,13 @@ def _efficiency(book: Book) -> str:
         f"{r.robot} {v}, seed {r.seed}" for v in ("ours", "baseline") for r in book.group("sample_efficiency", v).failed
     ]
     return (
-        "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are seeds, "
-        "thick ones their mean. The baseline sees the goal in the place of waypoints; all else is the same, the scale "
-        "of its rewards apart, which are larger. Returns in the curves are by each one’s own reward and not to be "
-        "compared; those in the table are of both by the baseline’s, as in the paper, except that here it has terms "
-        "that the paper’s lacks: leaving the field, tilting and falling cost as well. The paper’s own curves are "
-        f"printed without numbers; its networks of Table III were trained for 3,000,000 steps.</p><p>{_RECOVERY}</p>"
+        "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are "
+        "seeds, thick ones the mean of those that are of the settings of now. The baseline sees the goal in the place "
+        "of waypoints; all else is the same, the scale of its rewards apart, which are larger. Returns in the curves "
+        "are by each one’s own reward and not to be compared; those in the table are of both by the baseline’s, as "
+        "in the paper, except that here it has terms that the paper’s lacks: leaving the field, tilting and falling "
+        "cost as well. The paper’s own curves are printed without numbers; its networks of Table III were trained for "
+        f"3,000,000 steps.</p><p>{_RECOVERY}</p>"
         + (f'<p class="short">Failed: {escape(", ".join(failed))}.</p>' if failed else "")
         + _gallery(shown)
         + "<p>In the end, 1000 strict episodes in pillar(2,2,10) with A* plans:</p>"
@@ -244,19 +246,23 @@ def _provenance(book: Book) -> str:
     commits = Counter(
         (result.commit or "no repository")[:10] + (" with changes" if result.dirty else "") for result in results
     )
-    machines = sorted({f"{r.machine.cpu}, {r.machine.cores} cores, {r.machine.system}" for r in results})
+    machines = sorted(
+        {
+            ", ".join([m.cpu, f"{m.cores} cores", *([m.gpu] if m.gpu else []), m.system])
+            for m in (result.machine for result in results)
+        }
+    )
     versions = sorted({json.dumps(r.machine.versions, sort_keys=True) for r in results})
     failed = [r for r in results if r.state == "failed"]
     rows = []
-    planned_of = Counter(cell.experiment for cell in book.cells)
+    known = {result.id for result in results}
     for name in EXPERIMENTS:
-        planned = planned_of[name]
+        planned = [cell for cell in book.cells if cell.experiment == name]
         mine = [r for r in results if r.experiment == name]
         done, wrong = sum(r.state == "done" for r in mine), sum(r.state == "failed" for r in mine)
         hours = sum(r.seconds for r in mine) / 3600
-        rows.append(
-            [name, str(done), str(wrong), str(max(planned - len(mine), 0)) if planned else "?", f"{hours:.2f} h"]
-        )
+        missing = str(sum(cell.id not in known for cell in planned)) if planned else "?"
+        rows.append([name, str(done), str(wrong), missing, f"{hours:.2f} h"])
     parts = [
         "<p>Every number is from a file in <code>results/</code>, with its seed, commit, settings, machine, duration "
         "and the command that makes it.</p>",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
+import msgspec
+
 from hiernav.report import paper
 from hiernav.report.book import Book, Estimate, Group, of_seeds
 from hiernav.reproduce.experiments import (
@@ -19,6 +21,7 @@ from hiernav.reproduce.experiments import (
     WORLDS,
     table2_updates,
 )
+from hiernav.reproduce.results import PlanWalks
 
 NOT_RUN = '<span class="none">not run yet</span>'
 _DIGITS = {"reach_rate": 3, "steps_mean": 1, "collisions_mean": 2, "collision_free_rate": 3, "spl_mean": 3}
@@ -114,12 +117,15 @@ def walks(book: Book, robot: str) -> str:
     rows = []
     for world in (*WORLDS, *UNSEEN):
         group = book.group("walks", "shipped", robot, world)
+        notes = ["" if world in WORLDS else "unseen", group.age]
+        first = " ".join([escape(world), *(f"<small>{note}</small>" for note in notes if note)])
         for result in group.done:
-            found, notes = result.metrics, ["" if world in WORLDS else "unseen", group.age]
-            row = [" ".join([escape(world), *(f"<small>{note}</small>" for note in notes if note)])]
-            row += [f"{found[name]['collisions_mean']:.3f}" for name in ("network", "verified")]
-            row += [f"{found[name]['reach_rate']:.3f}" for name in ("network", "verified", "astar")]
-            rows.append([*row, f"{100.0 * found['verified']['repairs'] / found['verified']['proposals']:.1f} %"])
+            found = msgspec.convert(result.metrics, PlanWalks)
+            row = [f"{walked.collisions_mean:.3f}" for walked in (found.network, found.verified)]
+            row += [f"{walked.reach_rate:.3f}" for walked in (found.network, found.verified, found.astar)]
+            share, count = found.verified.repairs, found.verified.proposals
+            rows.append([first, *row, f"{100.0 * share / count:.1f} %" if count else "–"])
+        rows += [[first, '<span class="short">failed</span>', *["–"] * 5] for _ in group.failed]
     heads = [f"{what}<br><small>{who}</small>" for what, who in (
         ("collisions", "network"), ("collisions", "verified"), ("reach rate", "network"), ("reach rate", "verified"),
         ("reach rate", "A*"), ("repaired", "of the plans"),

@@ -46,7 +46,8 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}
     """All else that decides the outcome."""
     config: str | None = None
-    """Resolved configuration of a training (JSON, which is YAML)."""
+    """Resolved configuration of a training (JSON, which is YAML); where a planner alone is trained, what of it decides.
+    """
     bundle: str | None = None
     """Bundle that drives, relative to the root."""
     run: str | None = None

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from hiernav.reproduce.cells import Cell, Places
+from hiernav.reproduce.results import Code
 from hiernav.reproduce.work import Outcome, Report, run_cell
 
 _PATIENCE = 20.0
@@ -28,8 +29,8 @@ def log_path(places: Places, cell: Cell) -> Path:
     return places.runs / "logs" / f"{cell.experiment}-{cell.name}.log"
 
 
-def run_in_process(cell: Cell, places: Places, report: Report) -> Outcome:
-    """Do a cell's work in another process.
+def run_in_process(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
+    """Do a cell's work in another process, which is told what `code` it runs.
 
     Raises:
         CellFailed: the work raised an error, or its process died.
@@ -37,7 +38,7 @@ def run_in_process(cell: Cell, places: Places, report: Report) -> Outcome:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])  # loaded once, for all cells
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_main, args=(cell, places, theirs), name=cell.id)
+    process = context.Process(target=_main, args=(cell, places, code, theirs), name=cell.id)
     process.start()
     theirs.close()
     try:
@@ -64,7 +65,7 @@ def run_in_process(cell: Cell, places: Places, report: Report) -> Outcome:
             process.join()
 
 
-def _main(cell: Cell, places: Places, parent: Connection) -> None:
+def _main(cell: Cell, places: Places, code: Code, parent: Connection) -> None:
     signal.signal(signal.SIGTERM, _stop)
     _end_with_parent()
     log = log_path(places, cell)
@@ -77,7 +78,7 @@ def _main(cell: Cell, places: Places, parent: Connection) -> None:
         parent.send(("report", share, what))
 
     try:
-        parent.send(("done", run_cell(cell, places, report)))
+        parent.send(("done", run_cell(cell, places, report, code)))
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:

@@ -6,6 +6,7 @@ First what needs no training (the bundles that ship), then the paper's own train
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,6 +17,7 @@ import msgspec
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.film.film import film_name
+from hiernav.finetune import DEFAULTS
 from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind
 from hiernav.sim.layout import parse_world
@@ -166,6 +168,9 @@ def _table2(size: Size, seeds: int) -> list[Cell]:
                         seed=seed,
                         world=size.worlds[0],
                         settings=settings,
+                        config=passes.what_decides(
+                            passes.configuration(samples, preset, seed, size.worlds[0], settings=size.table2_settings)
+                        ),
                         seconds=size.share * (60 + samples / 1500 + passes.epochs(samples) * samples / 1700),
                     )  # fmt: skip
                 )
@@ -269,6 +274,15 @@ class _Maker:
         config = _load(file, file.stat().st_mtime_ns, (*overrides, *self.size.training, "run_dir=null"))
         return msgspec.json.encode(msgspec.structs.replace(config, seed=seed)).decode()
 
+    def _fine_tuning_config(self, world: str, trained: bool) -> str:
+        """What decides a fine-tuning of a trained run, or of the bundle, whose own part its hashes tell."""
+        overrides = [f"{key}={value}" for key, value in DEFAULTS.items()]
+        overrides += [f"planner.worlds={json.dumps([world])}", *self.size.fine_tuning]
+        if not trained:
+            return passes.what_decides(load_config(None, [f"robot={self.robot}", *overrides]))
+        file = self.root / "configs" / f"{self.robot}.yaml"
+        return passes.what_decides(_load(file, file.stat().st_mtime_ns, (*self.size.training, *overrides)))
+
     def _train(
         self, experiment: str, variant: str, seed: int, overrides: list[str], needs: tuple[str, ...] = ()
     ) -> Cell:
@@ -306,13 +320,15 @@ class _Maker:
         needs: tuple[str, ...] = (),
     ) -> Cell:
         settings = {"episodes": self.size.episodes, "paper_episodes": self.size.paper_episodes, **(settings or {})}
+        config = None
         if fine_tuned:
             settings["fine_tuning"] = list(self.size.fine_tuning)
+            config = self._fine_tuning_config(world, trained=run is not None)
         parts = [self.robot, variant, *([] if seed is None else [str(seed)]), _slug(world)]
         return Cell(
             experiment=experiment, name="-".join(parts), kind="finetune" if fine_tuned else "evaluate",
-            robot=self.robot, variant=variant, seed=seed, world=world, settings=settings, bundle=bundle, run=run,
-            needs=needs,
+            robot=self.robot, variant=variant, seed=seed, world=world, settings=settings, config=config, bundle=bundle,
+            run=run, needs=needs,
             seconds=self.size.share * (EVALUATION_SECONDS[self.robot] + fine_tuned * FINE_TUNING_SECONDS),
         )  # fmt: skip
 

@@ -11,10 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
+import msgspec
+
 from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
 from hiernav.reproduce.results import (
+    Code,
     Machine,
     Result,
     ResultError,
@@ -24,11 +27,12 @@ from hiernav.reproduce.results import (
     this_machine,
     write_result,
 )
-from hiernav.reproduce.work import Outcome, Report, trained_seconds
+from hiernav.reproduce.work import Outcome, Report, is_trained_here, trained_seconds
+from hiernav.run import RunError
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
 """`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
-Execute = Callable[[Cell, Places, Report], Outcome]
+Execute = Callable[[Cell, Places, Report, Code], Outcome]
 
 
 @dataclass(frozen=True)
@@ -121,9 +125,10 @@ class Estimates:
             result = entry.result
             if result is None or entry.state != "done":
                 continue
+            spent = _spent(entry.cell, places)
             here = (result.machine.cpu, result.machine.cores) == (machine.cpu, machine.cores)
             # one that took less than its training did counts the last process of several alone
-            if here and result.seconds >= trained_seconds(entry.cell, places):
+            if here and spent is not None and result.seconds >= spent:
                 self.learn(entry.cell, result.seconds)
 
     def learn(self, cell: Cell, seconds: float) -> None:
@@ -156,26 +161,31 @@ class Queue:
 
     def left(self, retry: bool = False) -> list[Cell]:
         """Cells that a run would start, those included that wait for others."""
-        return [e.cell for e in self.entries() if not e.settled or (retry and e.state != "done")]
+        return [entry.cell for entry in self._unsettled(retry)]
+
+    def _unsettled(self, retry: bool) -> list[Entry]:
+        return [entry for entry in self.entries() if not entry.settled or (retry and entry.state != "done")]
 
     def run(self, budget: float | None = None, retry: bool = False, watcher: Watcher | None = None) -> Tally:
         """Run what is left. Stopping it at any time, with Ctrl-C or SIGTERM, loses an evaluation at most.
 
         Args:
-            budget: seconds; no cell is started whose estimate does not fit into what is left of them.
+            budget: seconds; no cell is started whose estimate, less what its training has taken before, does not fit
+                into what is left of them.
             retry: whether to run failed cells again, and those whose result file is damaged.
         """
         watcher, tally = watcher or Watcher(), Tally()
         began = time.monotonic()
         try:
-            for cell in self.left(retry):
+            for before in self._unsettled(retry):
+                cell = before.cell
                 why = self._why_not(cell, None if budget is None else budget - (time.monotonic() - began))
                 if why is None:
                     with _claimed(cell, self.places) as mine:
                         if not mine:
                             why = "another queue runs it"
-                        elif look_up(cell, self.places).state == "done":
-                            why = "another queue has run it"
+                        elif (now := look_up(cell, self.places)).settled and now != before:
+                            why = f"another queue has run it: {now.state}"
                         else:
                             self._run(cell, watcher, tally)
                 if why is not None:
@@ -187,11 +197,11 @@ class Queue:
 
     def _run(self, cell: Cell, watcher: Watcher, tally: Tally) -> None:
         key, started, began = cell_key(cell, self.places), time.strftime("%Y-%m-%dT%H:%M:%S%z"), time.monotonic()
-        trained_before, (commit, dirty) = trained_seconds(cell, self.places), self._code()
+        trained_before, code = _spent(cell, self.places) or 0.0, self._code()
         watcher.began(cell, self.estimate(cell))
         outcome, error = Outcome({}, {}, dict(cell.settings)), None
         try:
-            outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what))
+            outcome = self._execute(cell, self.places, lambda share, what: watcher.progress(cell, share, what), code)
         except CellFailed as failure:
             error = str(failure)
         seconds = trained_before + time.monotonic() - began
@@ -211,11 +221,11 @@ class Queue:
             command=cell.command,
             settings=outcome.settings,
             source=outcome.source,
-            commit=commit,
-            dirty=dirty,
+            commit=code[0],
+            dirty=code[1],
             started=started,
             seconds=round(seconds, 1),
-            machine=self._machine,
+            machine=msgspec.structs.replace(self._machine, gpu=outcome.gpu),
             metrics=outcome.metrics,
             curves=outcome.curves,
             error=error,
@@ -228,7 +238,7 @@ class Queue:
             tally.failed[cell.id] = error
         watcher.ended(cell, result, None)
 
-    def _code(self) -> tuple[str | None, bool | None]:
+    def _code(self) -> Code:
         """Commit of a cell that starts now, and whether it runs other code: what drives was loaded with the queue, what
         trains is read when a cell starts."""
         commit, dirty = git_state(self.places.root, self.places.results)
@@ -240,10 +250,26 @@ class Queue:
         """Why a cell cannot be started, if so."""
         known = {each.id: each for each in self.cells}
         for need in cell.needs:
-            if need in known and (state := look_up(known[need], self.places).state) != "done":
+            if need not in known:
+                continue
+            if (state := look_up(known[need], self.places).state) != "done":
                 return f"needs {need}, which is {state}"
-        if left is not None and (estimate := self.estimate(cell)) > left:
-            return f"takes about {duration(estimate)}, and {duration(max(left, 0.0))} are left"
+            if cell.run is not None and known[need].run == cell.run and not is_trained_here(known[need], self.places):
+                return (
+                    f"needs {need}, which was trained elsewhere: copy its run folder to {self.places.runs / cell.run}, "
+                    "or remove its result, so that it is trained here"
+                )
+        if left is None:
+            return None
+        ahead = max(self.estimate(cell) - (_spent(cell, self.places) or 0.0), 0.0)
+        return f"takes about {duration(ahead)}, and {duration(max(left, 0.0))} are left" if ahead > left else None
+
+
+def _spent(cell: Cell, places: Places) -> float | None:
+    """Seconds that a cell's training has taken so far; None where its run folder is damaged."""
+    try:
+        return trained_seconds(cell, places)
+    except RunError:
         return None
 
 

@@ -15,6 +15,9 @@ import msgspec
 from hiernav import __version__
 from hiernav.run import write_atomically
 
+Code = tuple[str | None, bool | None]
+"""What a process runs: the commit, and whether it is other code than that; None and None where there is no git."""
+
 _PACKAGES = ("numpy", "mujoco", "onnxruntime", "torch", "torchrl")
 
 
@@ -31,7 +34,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     system: str
     versions: dict[str, str]
     gpu: str | None = None
-    """That updates are computed on unless the settings say otherwise."""
+    """That torch found in the process that did the work; in results of older versions that the system has."""
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -213,7 +216,7 @@ def _check_contents(result: Result) -> None:
 
 
 def this_machine() -> Machine:
-    """What results of this process are made on."""
+    """What results of this process are made on; which GPU, if any, is for whoever computes on it to say."""
     versions = {"hiernav": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -221,10 +224,10 @@ def this_machine() -> Machine:
         except PackageNotFoundError:
             pass
     system = f"{platform.system()} {platform.machine()}"
-    return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions, gpu=_gpu())
+    return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions)
 
 
-def git_state(root: Path, results: Path) -> tuple[str | None, bool | None]:
+def git_state(root: Path, results: Path) -> Code:
     """Commit of a repository and whether tracked files differ from it, results apart; None and None without git."""
     folders = {root / "results", results}
     excluded = [f":(exclude){folder.relative_to(root)}" for folder in folders if folder.is_relative_to(root)]
@@ -252,15 +255,6 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or "unknown"
-
-
-def _gpu() -> str | None:
-    for file in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):
-        for line in file.read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name == "Model":
-                return value.strip()
-    return None
 
 
 def _cores() -> int:

@@ -8,19 +8,21 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from hiernav.config import OptionConfig, RewardConfig, load_config
+from hiernav.config import OptionConfig, RewardConfig, TrainConfig, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
-from hiernav.reproduce.cells import Cell, Places, bundle_hashes, cell_key
+from hiernav.planner import passes
+from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key
 from hiernav.reproduce.experiments import differences
-from hiernav.reproduce.results import git_state
+from hiernav.reproduce.results import Code
 from hiernav.run import spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
@@ -44,24 +46,38 @@ class Outcome:
     source: dict[str, Any]
     settings: dict[str, Any] = field(default_factory=dict)
     curves: dict[str, list[dict[str, float | None]]] = field(default_factory=dict)
+    gpu: str | None = None
+    """That torch found, if it was of use at all."""
 
 
-def run_cell(cell: Cell, places: Places, report: Report) -> Outcome:
-    """Do the work of a cell whose needs are met; a training goes on from its last checkpoint."""
-    return {
+def run_cell(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
+    """Do the work of a cell whose needs are met; a training goes on from its last checkpoint.
+
+    Args:
+        code: what this process runs, for a training to note. It is not asked of git here: what the process was forked
+            from had loaded its modules before, and a commit may have come since.
+    """
+    works: dict[Kind, Callable[[Cell, Places, Report], Outcome]] = {
         "evaluate": _evaluate,
-        "finetune": _fine_tune,
-        "train": _train,
-        "table2": _table2,
+        "finetune": partial(_fine_tune, code=code),
+        "train": partial(_train, code=code),
+        "table2": partial(_table2, code=code),
         "walk": _walk,
         "film": _film,
-    }[cell.kind](cell, places, report)
+    }
+    return replace(works[cell.kind](cell, places, report), gpu=_gpu())
+
+
+def _gpu() -> str | None:
+    torch = sys.modules.get("torch")  # what drives a bundle does without
+    return torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else None
 
 
 def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
     """Run folder that a cell trains, and the stages that it trains there; none for cells that train nothing."""
     if cell.kind == "table2":
-        return places.runs / "table2" / cell.name, ("planner",)
+        assert cell.config is not None, cell.id
+        return places.runs / "table2" / f"{cell.name}-{passes.digest(cell.config)}", ("planner",)
     if cell.kind == "finetune":
         return places.runs / f"{cell.experiment}-{cell.name}-{cell_key(cell, places)[:8]}", ("planner",)
     if cell.kind != "train" or cell.run is None:
@@ -70,20 +86,33 @@ def training_of(cell: Cell, places: Places) -> tuple[Path, tuple[str, ...]]:
     return places.runs / cell.run, ("planner", "skill") if stage == "all" else (stage,)
 
 
+def is_trained_here(cell: Cell, places: Places) -> bool:
+    """Whether the run folder of a training holds what it trained, to its end.
+
+    Where it was trained elsewhere its result came alone, and may have come while this place was half way with it.
+    """
+    folder, stages = training_of(cell, places)
+    try:
+        ended = json.loads((folder / "summary.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return all(stage in ended and (folder / stage / "checkpoint.pt").is_file() for stage in stages)
+
+
 def trained_seconds(cell: Cell, places: Places) -> float:
     """What the training of a cell has taken so far, as its run folder tells."""
     folder, stages = training_of(cell, places)
     return sum(spent_seconds(folder, stage) for stage in stages)
 
 
-def _noting_commit(folder: Path, places: Places, report: Report) -> Report:
+def _noting_commit(folder: Path, code: Code, report: Report) -> Report:
     """`report`, which before it first says something of a training notes in the run folder what trains there."""
     noted = False
 
     def note(share: float, what: str) -> None:
         nonlocal noted
         if not noted:
-            commit, dirty = git_state(places.root, places.results)
+            commit, dirty = code
             with (folder / _COMMITS).open("a") as file:
                 file.write(f"{commit or 'no repository'}{' with changes' if dirty else ''}\n")
             noted = True
@@ -179,7 +208,7 @@ def _evaluate(cell: Cell, places: Places, report: Report) -> Outcome:
     return Outcome(driven(open_policies(folder), cell.world, cell.settings, report), source, cell.settings)
 
 
-def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
+def _fine_tune(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     """Fine-tune the planner on the cell's world, then drive there."""
     from hiernav.finetune import begin_fine_tuning, fine_tuning_config
 
@@ -188,14 +217,14 @@ def _fine_tune(cell: Cell, places: Places, report: Report) -> Outcome:
     folder, _ = training_of(cell, places)
     if not (folder / "skill" / "checkpoint.pt").exists():
         shutil.rmtree(folder, ignore_errors=True)  # begun by an older version and killed: nothing to go on with
-        overrides = [f"planner.worlds={json.dumps([cell.world])}", f"run_dir={folder}", f"seed={cell.seed or 0}"]
+        overrides = [f"planner.worlds={json.dumps([cell.world])}", _run_dir(folder), f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
-    _train_run(folder, "planner", _noting_commit(folder, places, report))
+    _train_run(folder, "planner", _noting_commit(folder, code, report))
     metrics = driven(open_policies(folder), cell.world, cell.settings, report)
     return Outcome(metrics, {**about, "fine_tuned": folder.name, "commits": _commits(folder)}, cell.settings)
 
 
-def _train(cell: Cell, places: Places, report: Report) -> Outcome:
+def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     """Train the skill, then drive with A* plans; or train the planner of a run whose skill is trained."""
     from hiernav.run import Run
 
@@ -205,8 +234,8 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
         folder.mkdir(parents=True, exist_ok=True)
         given = folder / "given.yaml"
         given.write_text(cell.config)
-        Run.create(load_config(given, [f"run_dir={folder}"])).close()
-    _train_run(folder, stage, _noting_commit(folder, places, report))
+        Run.create(load_config(given, [_run_dir(folder)])).close()
+    _train_run(folder, stage, _noting_commit(folder, code, report))
     if stage == "planner":
         curves = {"planner": _curve(folder, "planner")}
         metrics: dict[str, Any] = {"last": curves["planner"][-1]}
@@ -219,16 +248,28 @@ def _train(cell: Cell, places: Places, report: Report) -> Outcome:
         found = driven(open_policies(folder), cell.world or "", settings, report, reward)
         metrics = {"best": {key: value for key, value in best.items() if key != "seconds"}, **found}
     source = {"run": cell.run, "commits": _commits(folder)}
-    return Outcome(metrics, source, {**cell.settings, **differences(Run.open(folder).config)}, curves)
+    config = Run.open(folder).config
+    computed = {key: value for part in training_of(cell, places)[1] for key, value in _computed(config, part).items()}
+    return Outcome(metrics, source, {**cell.settings, **differences(config), **computed}, curves)
 
 
-def _table2(cell: Cell, places: Places, report: Report) -> Outcome:
+def _computed(config: TrainConfig, stage: str) -> dict[str, str]:
+    """Device and precision that a stage is trained with in this process, "auto" resolved."""
+    from hiernav.device import choose_device, choose_precision
+
+    given = config.planner if stage == "planner" else config.skill
+    device = choose_device(given.device, f"{stage}.device")
+    precision = str(choose_precision(given.precision, device)).removeprefix("torch.")
+    return {f"{stage}.device": device.type, f"{stage}.precision": precision}
+
+
+def _table2(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     from hiernav.planner.table import measure
 
     assert cell.world is not None and cell.seed is not None
     wanted = cell.settings
     folder, (run, _) = places.runs / "table2", training_of(cell, places)
-    tell = _noting_commit(run, places, report)
+    tell = _noting_commit(run, code, report)
 
     def show(what: str, done: int, total: int) -> None:
         tell(done / total, f"{what}: {done:,} of {total:,}")
@@ -269,6 +310,11 @@ def _film(cell: Cell, places: Places, report: Report) -> Outcome:
     )
     metrics = {"file": file.name, "bytes": file.stat().st_size, "reached": sum(e.reached for e in episodes)}
     return Outcome(metrics, source, cell.settings)
+
+
+def _run_dir(folder: Path) -> str:
+    """The setting, for a path that YAML could take for something else too: "~/a", "a #1", "[x]"."""
+    return f"run_dir={json.dumps(str(folder))}"
 
 
 def _train_run(folder: Path, stage: str, report: Report) -> None:

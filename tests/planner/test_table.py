@@ -34,7 +34,23 @@ def test_an_entry_whose_data_set_was_interrupted_goes_on_with_it(tmp_path: Path,
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(store, "_make_shard", interrupted)
         entry(tmp_path, 24)
-    manifest = read_manifest(tmp_path / "data-paper-0")
+    (data,) = tmp_path.glob("data-paper-0-*")
+    manifest = read_manifest(data)
     assert (manifest.samples, manifest.made) == (24, 8)
     assert entry(tmp_path, 24)["samples"] == 24
-    assert read_manifest(tmp_path / "data-paper-0").finished
+    assert read_manifest(data).finished
+
+
+def test_an_entry_of_another_world_or_other_settings_has_a_planner_and_a_data_set_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(planner_train, "_WALKS", 2)
+
+    def made(world: str, *settings: str) -> dict[str, set[str]]:
+        before = set(tmp_path.iterdir())
+        more = {"episodes": 2, "threads": 1, "settings": (*SETTINGS, *settings)}
+        assert measure(tmp_path, 12, "paper", 0, world=world, **more)["world"] == world
+        return {folder.name.partition("-")[0] for folder in set(tmp_path.iterdir()) - before}
+
+    assert made("pillar(1.2,1.2,2)") == {"paper", "data"}
+    assert made("two-room(1.2,1.2)") == {"paper", "data"}
+    assert made("two-room(1.2,1.2)", "planner.epochs=2") == {"paper"}, "the same labels serve longer trainings"
+    assert made("two-room(1.2,1.2)") == set()

@@ -6,12 +6,15 @@ import fcntl
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from hiernav.reproduce.cells import Cell, Places
+from hiernav.finetune import DEFAULTS
+from hiernav.planner import passes
+from hiernav.reproduce.cells import Cell, Places, cell_key
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
@@ -45,7 +48,7 @@ class Work:
     def __init__(self, **errors: BaseException) -> None:
         self.errors, self.calls = errors, []
 
-    def __call__(self, cell, places, report):
+    def __call__(self, cell, places, report, code):
         self.calls.append(cell.name)
         report(0.5, "half of it")
         if cell.name in self.errors:
@@ -88,6 +91,23 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(places):
     queue.run(retry=True)
     assert work.calls == ["a", "b"]
     assert {entry.state for entry in queue.entries()} == {"done"}
+
+
+def test_what_drives_a_training_that_was_made_elsewhere_waits_for_its_run_folder(places):
+    training = cell("t", kind="train", run="t-0", settings={"stage": "skill"})
+    drive = cell("d", run="t-0", needs=(training.id,))
+    compared = cell("c", kind="train", run="c-0", settings={"stage": "skill"}, needs=(training.id,))
+    Queue([training], places, Work()).run()
+    queue = Queue([training, drive, compared], places, work := Work())
+    tally = queue.run()
+    assert work.calls == ["c"], "a training that is only compared with another needs no more than its result"
+    assert "needs astar/t, which was trained elsewhere" in tally.skipped[drive.id]
+    assert str(places.runs / "t-0") in tally.skipped[drive.id] and read_result(places.results, drive.id) is None
+    (places.runs / "t-0" / "skill").mkdir(parents=True)
+    (places.runs / "t-0" / "skill" / "checkpoint.pt").touch()
+    assert queue.run().skipped.keys() == {drive.id}, "a training that is half way here was driven"
+    (places.runs / "t-0" / "summary.json").write_text('{"skill": {}}')
+    assert queue.run().done == [drive.id]
 
 
 def test_no_cell_is_started_that_does_not_fit_into_the_budget(places):
@@ -135,7 +155,7 @@ def test_a_result_has_the_commit_at_which_its_cell_started(places):
     commits = [commit("hiernav/code.py")]
     following = {"a": "docs/text.md", "b": "hiernav/code.py"}
 
-    def work(cell, places, report):
+    def work(cell, places, report, code):
         if cell.name in following:
             commits.append(commit(following[cell.name]))
         return Outcome({"strict": DRIVE}, {})
@@ -147,6 +167,20 @@ def test_a_result_has_the_commit_at_which_its_cell_started(places):
         (commits[1], False),
         (commits[2], True),  # some of it was loaded before
     ]
+
+
+def test_a_training_is_told_the_code_that_its_result_names(places, monkeypatch):
+    told = []
+
+    def work(cell, places, report, code):
+        told.append(code)
+        return Outcome({"strict": DRIVE}, {})
+
+    queue = Queue([cell("a")], places, work)
+    monkeypatch.setattr(Queue, "_code", lambda _: ("abc", True))
+    queue.run()
+    result = read_result(places.results, "astar/a")
+    assert told == [("abc", True)] == [(result.commit, result.dirty)]
 
 
 def test_a_training_that_went_on_took_what_all_its_processes_took(places):
@@ -169,6 +203,33 @@ def test_a_training_that_went_on_took_what_all_its_processes_took(places):
     assert left_after(34.0) == 600.0, "the seconds of its last process say nothing about a training"
 
 
+def started(places: Places, seconds: float) -> Cell:
+    """A training that has taken some seconds."""
+    training = cell("t", 2400.0, kind="train", run="t-0", settings={"stage": "skill"})
+    (places.runs / "t-0").mkdir(parents=True)
+    line = {"stage": "skill", "step": 500_000, "steps_per_second": 210.0, "seconds": seconds}
+    (places.runs / "t-0" / "rates.jsonl").write_text(json.dumps(line) + "\n")
+    return training
+
+
+@pytest.mark.parametrize(("spent", "starts"), [(2350.0, True), (1000.0, False), (9000.0, True)])
+def test_a_budget_counts_what_is_left_of_a_training(places, spent, starts):
+    tally = Queue([started(places, spent)], places, Work()).run(budget=1200.0)
+    assert bool(tally.done) is starts
+    if not starts:
+        assert tally.skipped["astar/t"].startswith(f"takes about {duration(1400.0)}")
+
+
+def test_a_damaged_run_folder_ends_no_queue(places):
+    training = started(places, 100.0)
+    Queue([training], places, Work()).run()
+    (places.runs / "t-0" / "rates.jsonl").write_text("\0\0\n")
+    queue = Queue([training, cell("u", kind="train", run="t-0", settings={"stage": "skill"})], places, Work())
+    assert [entry.state for entry in queue.entries()] == ["done", "open"]
+    assert queue.estimate(training) == 2400.0
+    assert queue.run(budget=1e5).done == ["astar/u"]
+
+
 def test_estimates_follow_what_cells_of_a_kind_took(places):
     queue = Queue([cell("a", 10.0), cell("film", 10.0, kind="film")], places, Work())
     queue.estimate.learn(cell("a", 10.0), 30.0)
@@ -187,6 +248,20 @@ def test_other_settings_make_a_cell_open_again(places):
     assert look_up(longer, places).state == "done", "an estimate is not a setting"
 
 
+def test_other_passes_or_another_fine_tuning_make_their_cells_open_again(places, monkeypatch):
+    def keys():
+        return {each.id: cell_key(each, replace(places, root=ROOT)) for each in catalogue(ROOT)}
+
+    before = keys()
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "UPDATES", 4_000)
+        changed = {name for name, key in keys().items() if key != before[name]}
+    assert changed == {name for name in before if name.startswith("table2/")} and len(changed) == 24
+    monkeypatch.setitem(DEFAULTS, "planner.epochs", "20")
+    changed = {name for name, key in keys().items() if key != before[name]}
+    assert changed == {name for name in before if "finetuned" in name} and len(changed) == 36
+
+
 def test_another_bundle_makes_its_cells_open_again(places):
     shutil.copytree(ROOT / "deploy/bundles/point", places.root / "bundle")
     cells = [cell("a", bundle="bundle"), cell("b")]
@@ -199,7 +274,7 @@ def test_another_bundle_makes_its_cells_open_again(places):
 def test_a_bundle_that_is_replaced_during_a_cell_leaves_no_result(places):
     shutil.copytree(ROOT / "deploy/bundles/point", places.root / "bundle")
 
-    def work(cell, places, report):
+    def work(cell, places, report, code):
         (places.root / "bundle" / "skill.onnx").write_bytes(b"another")
         return Outcome({}, {})
 
@@ -216,6 +291,23 @@ def test_two_queues_do_not_work_on_the_same_cell(places):
         fcntl.flock(file, fcntl.LOCK_EX)
         tally = Queue([cell("a"), cell("b")], places, work).run()
     assert work.calls == ["b"] and "another queue" in tally.skipped["astar/a"]
+
+
+@pytest.mark.parametrize("retry", [False, True])
+def test_what_another_queue_has_failed_at_meanwhile_is_not_tried_again(places, retry):
+    cells = [cell("a"), cell("b"), cell("c")]
+    Queue(cells[1:2], places, Work(b=CellFailed("before"))).run()
+    calls = []
+
+    def work(cell, places, report, code):
+        calls.append(cell.name)
+        if cell.name == "a":
+            Queue(cells[1:], places, Work(b=CellFailed("again"), c=CellFailed("too"))).run(retry=retry)
+        raise CellFailed("too")
+
+    tally = Queue(cells, places, work).run(retry=True)
+    assert calls == (["a"] if retry else ["a", "b"]), "b was not retried by the other queue, and is by this one"
+    assert tally.skipped["astar/c"] == "another queue has run it: failed"
 
 
 @pytest.mark.parametrize(

@@ -10,15 +10,18 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hiernav.evaluate import evaluate, open_policies
+from hiernav.reproduce import queue, work
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed, run_in_process
 from hiernav.reproduce.experiments import SMOKE, catalogue
-from hiernav.reproduce.results import git_state, read_result, read_results
-from hiernav.reproduce.work import driven, run_cell, trained_seconds
+from hiernav.reproduce.queue import Queue
+from hiernav.reproduce.results import read_result, read_results
+from hiernav.reproduce.work import Outcome, driven, run_cell, trained_seconds
 from hiernav.sim.layout import parse_world
 
 ROOT = Path(__file__).parents[2]
@@ -70,6 +73,7 @@ def test_a_fixed_period_is_what_lies_between_plans():
 
 @pytest.mark.train
 def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys):
+    places = replace(places, runs=places.runs / "#1 [x]: y")  # YAML would read it otherwise
     size = replace(SMOKE, training=(*SMOKE.training, "skill.num_envs=1", "skill.total_steps=384"))
     cell = next(c for c in catalogue(ROOT, size, 1, ["point"]) if c.id == "sample_efficiency/point-ours-0")
 
@@ -78,17 +82,30 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_cell(cell, places, stop)
+        run_cell(cell, places, stop, ("abc", False))
     capsys.readouterr()
-    outcome = run_cell(cell, places, lambda *_: None)
+    outcome = run_cell(cell, places, lambda *_: None, ("def", True))
     assert "going on after step 128 of 384" in capsys.readouterr().out
     assert [point["step"] for point in outcome.curves["evaluation"]] == [128, 256, 384]
-    (commit,) = outcome.source["commits"]  # both processes ran the same code
-    assert commit.removesuffix(" with changes") == str(git_state(ROOT, places.results)[0] or "no repository")
+    assert outcome.source["commits"] == ["abc", "def with changes"], "what the queue says that they ran"
     first, *_, last = [json.loads(line)["seconds"] for line in (places.runs / cell.run / "rates.jsonl").open()]
     assert 0.0 < first < last <= trained_seconds(cell, places)
+    assert outcome.settings["skill.device"] in ("cpu", "cuda")
+    assert outcome.settings["skill.precision"] in ("float32", "bfloat16")
     assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
+
+
+@pytest.mark.parametrize("gpu", ["NVIDIA H100", None])
+def test_a_gpu_is_told_by_the_process_that_computes_if_torch_sees_one_there(places, monkeypatch, gpu):
+    cuda = SimpleNamespace(is_available=lambda: gpu is not None, get_device_name=lambda: gpu)
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=cuda))
+    monkeypatch.setattr(work, "_walk", lambda *_: Outcome({}, {}))
+    cell = next(each for each in catalogue(ROOT) if each.kind == "walk")
+    written = []
+    monkeypatch.setattr(queue, "write_result", lambda _, result: written.append(result))
+    Queue([cell], places, run_cell).run()
+    assert [result.machine.gpu for result in written] == [gpu]
 
 
 def test_an_error_in_a_cells_process_is_its_failure(places):
@@ -97,7 +114,7 @@ def test_an_error_in_a_cells_process_is_its_failure(places):
         world="gremlin", bundle="deploy/bundles/nothing", settings={"episodes": 1},
     )  # fmt: skip
     with pytest.raises(CellFailed, match="deploy/bundles/nothing"):
-        run_in_process(cell, places, lambda *_: None)
+        run_in_process(cell, places, lambda *_: None, (None, None))
     log = places.runs / "logs" / "astar-a.log"
     assert "Traceback" in log.read_text()
 
@@ -112,7 +129,7 @@ def test_a_process_that_dies_is_a_failure_that_names_the_signal(places):
         child.kill()
 
     with pytest.raises(CellFailed, match="SIGKILL"):
-        run_in_process(cell, places, kill)
+        run_in_process(cell, places, kill, (None, None))
 
 
 def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result(tmp_path):
