@@ -29,7 +29,7 @@ demo: $(BASE_STAMP) ## drive simulated robots in real time with the shipped netw
 test: $(DEV_STAMP) ## run the tests, slow and real-time ones left out
 	@$(BIN)/python -m pytest $(TEST_ARGS)
 
-soak: $(DEV_STAMP) ## a million ticks of the loop under random faults (half an hour)
+soak: $(DEV_STAMP) ## a million ticks of the loop under random faults (five to thirty minutes)
 	@$(BIN)/python -m pytest -m slow -s tests/runtime/test_soak.py
 
 mutants: $(DEV_STAMP) ## switch each watchdog off in turn; the test of its fault must fail
