@@ -78,6 +78,7 @@ class Estimator:
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
         self._rejected: Counter[str] = Counter()
+        self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}
         self._history: deque[list[float]] = deque()
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
@@ -363,13 +364,22 @@ class Estimator:
         agrees = last is not None and math.dist(miss, last) <= (spread or self.config.reinit_spread)
         self.counts[f"{sensor}_rejected"] += 1
         self._rejected[sensor] += 1
-        patience = self.config.resync_after if sensor in ("velocimeter", "gyro") else self.config.reinit_after
-        if self._rejected[sensor] < patience or not agrees:
+        self._rejected_at[sensor] = self._stamp
+        if self._rejected[sensor] < self._patience(sensor) or not agrees:
             return False
         self.counts[f"{sensor}_reinit"] += 1
         moved = math.hypot(*miss) > self.config.reinit_spread
         self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
+
+    def _patience(self, sensor: str) -> int:
+        """Rejected measurements in a row after which the state must be wrong."""
+        return self.config.resync_after if sensor in ("velocimeter", "gyro") else self.config.reinit_after
+
+    def _may_yet_be_believed(self, sensor: str) -> bool:
+        """Whether a sensor speaks, is rejected, and has not had as many measurements as would be believed after all."""
+        speaks = self._stamp - self._rejected_at.get(sensor, -math.inf) < self.config.hold_after
+        return speaks and 0 < self._rejected[sensor] < self._patience(sensor)
 
     def _trust(self) -> tuple[Trust, str]:
         """What the estimate is good for, judged by the sensor that has been silent for too long."""
@@ -378,7 +388,7 @@ class Estimator:
             silence = self._watch.silence(name, self._stamp)
             if silence < hold:
                 continue
-            trust = Trust.LOST if silence >= lost else Trust.HOLD
+            trust = Trust.LOST if silence >= lost and not self._may_yet_be_believed(name) else Trust.HOLD
             if trust > worst:
                 flaw = self._flaws.get(name)
                 worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
