@@ -125,7 +125,7 @@ def sb3(hidden: int, device: str) -> Burst:
 
 
 def sbx(hidden: int, device: str) -> Burst:
-    """SBX's SAC: Stable-Baselines in JAX, compiled; the device is JAX's own choice."""
+    """SBX's SAC: Stable-Baselines in JAX, compiled."""
     os.environ["JAX_PLATFORMS"] = device
     from sbx import SAC
 
