@@ -341,6 +341,13 @@ def _train_run(folder: Path, stage: str, report: Report) -> None:
 
 
 def _curve(folder: Path, stage: str) -> list[dict[str, float | None]]:
-    """What a run logged of a stage: `step` and values."""
+    """What a run logged of a stage: `step` and values.
+
+    Raises:
+        ValueError: nothing, as in a run whose checkpoint of that stage came from elsewhere.
+    """
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in line.items() if k != "stage"} for line in lines if line["stage"] == stage]
+    curve = [{k: v for k, v in line.items() if k != "stage"} for line in lines if line["stage"] == stage]
+    if not curve:
+        raise ValueError(f"{folder / 'metrics.jsonl'} has no row of {stage!r}: it was not trained in this run")
+    return curve

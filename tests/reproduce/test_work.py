@@ -108,6 +108,13 @@ def test_a_gpu_is_told_by_the_process_that_computes_if_torch_sees_one_there(plac
     assert [result.machine.gpu for result in written] == [gpu]
 
 
+def test_a_run_that_got_its_planner_elsewhere_has_no_curve_of_it(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"stage": "evaluation", "step": 1, "reach_rate": 0.5}\n')
+    assert work._curve(tmp_path, "evaluation") == [{"step": 1, "reach_rate": 0.5}]
+    with pytest.raises(ValueError, match="no row of 'planner'"):
+        work._curve(tmp_path, "planner")
+
+
 def test_an_error_in_a_cells_process_is_its_failure(places):
     cell = Cell(
         experiment="astar", name="a", kind="evaluate", robot="point", variant="astar", seconds=1.0,
