@@ -22,6 +22,7 @@ REPLAN_COLORS = {
     TerminationReason.HALF_INDEX: "#319795",
     TerminationReason.INVALID: "#b83280",
 }
+"""Of what is marked. A plan that is outdated is not: where obstacles move, one is every few steps."""
 LIDAR = "#d69e2e"
 COLORS = (COLLISION, EDGE, GOAL, GREMLIN, LIDAR, OBSTACLE, PATH, PLAN, *REPLAN_COLORS.values())
 """Of everything that may appear in a film."""

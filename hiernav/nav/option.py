@@ -34,17 +34,22 @@ class TerminationReason(IntEnum):
     HALF_INDEX = 3
     INVALID = 4
     GOAL = 5
+    OUTDATED = 6
 
 
 # Looking a member up takes longer than the comparison it is used in, and the robot does so at every tick.
-_NONE, _START, _D_UPDATE, _HALF_INDEX, _INVALID, _GOAL = (int(reason) for reason in TerminationReason)
+_NONE, _START, _D_UPDATE, _HALF_INDEX, _INVALID, _GOAL, _OUTDATED = (int(reason) for reason in TerminationReason)
+
+REFRESH_S = 0.2
+"""How old a plan may get that was made on another map than the present one [s]."""
 
 
 @dataclass(frozen=True)
 class ReplanRule:
     """When an option ends: a rule without learned parts.
 
-    If several conditions hold the first of `start`, `goal`, `invalid`, `d_update`, `half_index` is the reason.
+    If several conditions hold the first of `start`, `goal`, `invalid`, `d_update`, `half_index`, `outdated` is the
+    reason.
     """
 
     d_update: float = 0.3
@@ -52,7 +57,8 @@ class ReplanRule:
     half_fraction: float = 0.5
     """Share of the waypoints behind the robot above which the plan is used up."""
     invalid: bool = True
-    """Whether a remaining plan that meets the current map is given up (beyond the paper)."""
+    """Whether a plan is given up whose rest meets the current map, or that is old and was made on another map (beyond
+    the paper)."""
     period: int | None = None
     """Replan every so many steps instead of by distance and index (the paper's comparison)."""
 
@@ -64,6 +70,7 @@ class ReplanRule:
         *,
         age: np.ndarray,
         blocked: np.ndarray,
+        outdated: np.ndarray,
         at_goal: np.ndarray,
         started: np.ndarray,
     ) -> np.ndarray:
@@ -75,6 +82,7 @@ class ReplanRule:
             count: number of waypoints of a plan.
             age: (N,) control steps since the plan was made.
             blocked: (N,) bool, the remaining plan meets the map.
+            outdated: (N,) bool, the plan is old and was made on another map; a fixed `period` is not cut short by it.
             at_goal: (N,) bool.
             started: (N,) bool, False before the first plan of an episode.
 
@@ -87,9 +95,11 @@ class ReplanRule:
         else:
             too_far, used_up = np.isnan(distance), age >= self.period
         reason = np.zeros(len(distance), dtype=np.int8)
-        if not np.count_nonzero(used_up | too_far | blocked | at_goal | ~started):
+        if not np.count_nonzero(used_up | too_far | blocked | outdated | at_goal | ~started):
             return reason
         # the last one that holds stays: from the least to the most important
+        if self.invalid and self.period is None:
+            reason[outdated] = _OUTDATED
         reason[used_up] = _HALF_INDEX
         reason[too_far] = _D_UPDATE
         if self.invalid:
@@ -173,6 +183,9 @@ class WaypointOption:
     """A robot this close to its goal has reached it [m]."""
     sweep_radius: float = 0.1
     """Radius with which the way to the closest waypoint and the plan from there on are swept for `invalid` [m]."""
+    refresh: int | None = None
+    """Control steps after which a plan is outdated if it was made on another map than the present one: obstacles that
+    move are avoided before they are in the way. None: never."""
     max_reach: float = 10.0
     """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
@@ -191,6 +204,7 @@ class WaypointOption:
         self._adopted = np.zeros(self.num_rows, dtype=bool)
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
+        self._refresh = np.iinfo(np.int64).max if self.refresh is None else self.refresh
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
         self._hit = np.zeros(self.num_rows)  # where it meets it last, counted in vertices of the line; 0 if nowhere
 
@@ -305,12 +319,14 @@ class WaypointOption:
             # on the map it was made for and where it was made, a blocked plan would only be proposed again
             moved = path.distances(position, self.start[pick]) > 0.05
             blocked &= (self.age[pick] > 1) & (moved | self._changed[pick])
+        age = self.age[pick]
         return self.rule(
             distance[:, 0],
             index[:, 0],
             self.num_waypoints,
-            age=self.age[pick],
+            age=age,
             blocked=blocked,
+            outdated=self._changed[pick] & (age >= self._refresh),
             at_goal=path.distances(position, goal) <= self.goal_radius,
             started=self.started[pick],
         )
@@ -378,7 +394,7 @@ class WaypointOption:
 
     def _follow(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> None:
         self.plan[row], self.start[row], self.age[row] = plan, start, 0
-        self._swept[row], self._planned_on[row] = None, occupancy
+        self._swept[row], self._planned_on[row], self._changed[row] = None, occupancy, False
 
 
 @dataclass
@@ -468,3 +484,8 @@ def guided(
     if time is not None:
         values["clock"] = clock_phase(time)
     return values
+
+
+def refresh_steps(control_period: float) -> int:
+    """`WaypointOption.refresh` of a robot with that control period [s]."""
+    return max(1, round(REFRESH_S / control_period))

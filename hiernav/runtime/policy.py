@@ -10,7 +10,7 @@ import onnxruntime as ort
 
 from hiernav.nav import goselo
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, TensorSpec
-from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption
+from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
 from hiernav.runtime.robot import Robot
 
@@ -195,6 +195,7 @@ def make_agent(
         num_waypoints=plan.waypoints,
         goal_radius=goal_radius,
         sweep_radius=robot_radius,
+        refresh=refresh_steps(bundle.manifest.control_period_s),
     )
     return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hiernav.config import TrainConfig
 from hiernav.nav.observation import ObservationLayout, observation_layout
-from hiernav.nav.option import Planner, ReplanRule, WaypointOption
+from hiernav.nav.option import Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
@@ -78,6 +78,7 @@ def make_task(
         num_waypoints=config.option.waypoints,
         goal_radius=GOAL_RADIUS,
         sweep_radius=robot.radius,
+        refresh=refresh_steps(robot.control_period),
     )
     return NavigationTask(
         robot,

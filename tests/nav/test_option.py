@@ -14,7 +14,7 @@ from hiernav.nav.option import ReplanRule, TerminationReason, WaypointOption
 from hiernav.nav.path import nearest_vertex, polyline
 from hiernav.nav.planners import StraightPlanner
 
-NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL = TerminationReason
+NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL, OUTDATED = TerminationReason
 FREE = map_with_pillars()
 FAR = (2.5, 0.0)
 DEFAULT = ReplanRule()
@@ -151,9 +151,9 @@ def test_reasons_are_counted_by_row() -> None:
     drive = Drive(num_rows=2)
     for x, y in [(0.0, 0.0), (0.3, 0.0), (0.6, 0.0), (0.6, 0.5), (2.5, 0.0)]:
         drive.at((x, y), (0.0, 0.0))
-    expected = {NONE: 1, START: 1, HALF_INDEX: 1, D_UPDATE: 1, GOAL: 1, INVALID: 0}
+    expected = {NONE: 1, START: 1, HALF_INDEX: 1, D_UPDATE: 1, GOAL: 1, INVALID: 0, OUTDATED: 0}
     assert {reason: int(drive.option.counts[0, reason]) for reason in TerminationReason} == expected
-    assert drive.option.counts[1].tolist() == [4, 1, 0, 0, 0, 0]
+    assert drive.option.counts[1].tolist() == [4, 1, 0, 0, 0, 0, 0]
 
 
 # batches and subsets
@@ -350,6 +350,50 @@ def test_a_plan_that_is_freed_again_goes_on() -> None:
     assert drive.at((0.1, 0.0)) == [INVALID]
     drive.map = FREE
     assert drive.at((0.1, 0.0)) == [NONE]
+
+
+def test_where_obstacles_move_a_plan_gets_no_older_than_refresh() -> None:
+    drive = Drive()
+    drive.option = WaypointOption(drive.planner, 1, refresh=3)
+    assert drive.at((0.0, 0.0)) == [START]
+    # as long as the map is the one that it was made on, it may get as old as it likes
+    assert [drive.at((0.1, 0.0)) for _ in range(4)] == [[NONE]] * 4
+    drive.map = map_with_pillars([(0.0, 2.0)])
+    assert drive.at((0.1, 0.0)) == [OUTDATED]
+    # the new one is of this map
+    assert [drive.at((0.1, 0.0)) for _ in range(4)] == [[NONE]] * 4
+    reasons = []
+    for step in range(7):  # one that moves all the time
+        drive.map = map_with_pillars([(0.0, 2.0 - 0.05 * step)])
+        reasons += drive.at((0.1, 0.0))
+    assert reasons == [OUTDATED, NONE, NONE, OUTDATED, NONE, NONE, OUTDATED]
+    assert drive.option.counts[0, OUTDATED] == 4
+
+
+def test_without_refresh_only_what_is_in_the_way_ends_a_plan() -> None:
+    drive = Drive()
+    drive.at((0.0, 0.0))
+    for step in range(30):
+        drive.map = map_with_pillars([(0.0, 2.0 - 0.01 * step)])
+        assert drive.at((0.1, 0.0)) == [NONE]
+
+
+def test_an_outdated_plan_is_followed_until_a_planner_that_works_elsewhere_answers() -> None:
+    class Elsewhere:
+        def plan(self, query: object) -> None:
+            return None
+
+    option, plan = WaypointOption(Elsewhere(), 1, refresh=1), np.linspace([0.1, 0.0], [1.0, 0.0], 10)
+    here, goal = np.zeros((1, 2)), np.array([FAR])
+    option.step(here, goal, [FREE])
+    assert option.adopt(0, plan, here[0], FREE)
+    moved = map_with_pillars([(0.0, 2.0)])
+    steps = [option.step(here, goal, [moved]) for _ in range(3)]
+    assert [TerminationReason(step.reason[0]) for step in steps] == [OUTDATED, NONE, NONE]  # it ends once
+    assert_array_equal(steps[-1].plan[0], plan)
+    assert option.waiting[0]
+    assert option.adopt(0, plan, here[0], moved)
+    assert not option.waiting[0]
 
 
 def test_in_the_paper_s_rule_the_map_does_not_end_a_plan() -> None:

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from hiernav.nav.option import ReplanRule, TerminationReason
 
-NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL = TerminationReason
+NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL, OUTDATED = TerminationReason
 DEFAULT = ReplanRule()
 
 
 def reason_of(rule: ReplanRule = DEFAULT, **values: object) -> TerminationReason:
     """What the rule says of one robot that is well on its plan, but for the values given."""
-    row = {"distance": 0.0, "index": 0, "age": 1, "blocked": False, "at_goal": False, "started": True} | values
+    row: dict[str, object] = {"distance": 0.0, "index": 0, "age": 1, "at_goal": False, "started": True}
+    row |= {"blocked": False, "outdated": False} | values
     columns = {name: np.array([value]) for name, value in row.items()}
     distance, index = columns.pop("distance"), columns.pop("index")
     return TerminationReason(rule(distance, index, 10, **columns)[0])
@@ -35,6 +36,7 @@ def test_a_robot_on_its_plan_goes_on() -> None:
         ({"blocked": True}, INVALID),
         ({"distance": 0.31}, D_UPDATE),
         ({"index": 6}, HALF_INDEX),
+        ({"outdated": True}, OUTDATED),
     ],
 )
 def test_each_condition_alone_ends_the_plan(values: dict, reason: TerminationReason) -> None:
@@ -48,8 +50,9 @@ def test_of_several_conditions_the_documented_first_one_is_the_reason() -> None:
         ({"blocked": True}, INVALID),
         ({"distance": 9.0}, D_UPDATE),
         ({"index": 9}, HALF_INDEX),
+        ({"outdated": True}, OUTDATED),
     ]
-    for count in range(1, 6):
+    for count in range(1, 7):
         for chosen in itertools.combinations(order, count):
             values = {key: value for condition, _ in chosen for key, value in condition.items()}
             assert reason_of(**values) == chosen[0][1], values
@@ -72,8 +75,14 @@ def test_a_distance_that_is_not_a_number_counts_as_too_far() -> None:
     assert reason_of(ReplanRule(period=8), distance=np.nan) == D_UPDATE
 
 
-def test_without_invalid_a_blocked_plan_goes_on() -> None:
+def test_without_invalid_a_blocked_or_outdated_plan_goes_on() -> None:
     assert reason_of(ReplanRule(invalid=False), blocked=True) == NONE
+    assert reason_of(ReplanRule(invalid=False), outdated=True) == NONE
+
+
+def test_a_fixed_period_is_not_cut_short_because_the_map_has_changed() -> None:
+    assert reason_of(ReplanRule(period=8), age=7, outdated=True) == NONE
+    assert reason_of(ReplanRule(period=8), age=8, outdated=True) == HALF_INDEX
 
 
 @given(st.floats(0.0, 5.0), st.integers(0, 10), st.integers(0, 40))
@@ -85,7 +94,7 @@ def test_with_a_period_neither_distance_nor_index_matters(distance: float, index
 @given(st.data())
 def test_a_batch_is_ruled_row_by_row(data: st.DataObject) -> None:
     rule = data.draw(st.builds(ReplanRule, invalid=st.booleans(), period=st.sampled_from([None, 4])))
-    flags = {"blocked": st.booleans(), "at_goal": st.booleans(), "started": st.booleans()}
+    flags = {name: st.booleans() for name in ("blocked", "outdated", "at_goal", "started")}
     numbers = {
         "distance": st.sampled_from([0.0, 0.3, 0.4, np.nan]),
         "index": st.integers(0, 10),
