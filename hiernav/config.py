@@ -234,6 +234,9 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     reward: RewardConfig = RewardConfig()
 
 
+LONGEST_PLAN = 10.0
+"""`WaypointOption.max_reach` [m]."""
+
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "planner": {
         "paper": {
@@ -343,6 +346,12 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
         raise ConfigError(
             f"{source}: option.waypoints = {config.option.waypoints}, expected {OptionConfig().waypoints}: "
             "that is how many a skill observes"
+        )
+    reach = config.option.waypoints * config.option.spacing_m
+    if reach > LONGEST_PLAN:
+        raise ConfigError(
+            f"{source}: option.waypoints = {config.option.waypoints} at option.spacing_m = {config.option.spacing_m:g} "
+            f"make {reach:g} m, expected at most {LONGEST_PLAN:g} m: longer plans are refused"
         )
     if skill.preset == "baseline" and skill.planner == "cnn":
         raise ConfigError(

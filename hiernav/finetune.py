@@ -21,7 +21,10 @@ DEFAULTS = {
     "planner.epochs": "4",
     "planner.learning_rate": "3e-4",
 }
-"""What differs from the source's own training, unless it is said otherwise."""
+"""What differs from the source's own training, unless it is said otherwise.
+
+A bundle does not hold the worlds or the reward that it was trained with: there they are the robot's defaults.
+"""
 _CHANGEABLE = {
     "seed", "threads", "run_dir", "planner.data", "planner.samples", "planner.samples_per_world", "planner.epochs",
     "planner.batch_size", "planner.device", "planner.learning_rate", "planner.weight_decay", "planner.precision",

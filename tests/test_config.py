@@ -261,6 +261,7 @@ def test_an_override_into_a_section_of_a_wrong_type_blames_the_file(tmp_path: Pa
         (["skill.total_steps=1000"], ["skill.learning_starts = 2000", "skill.total_steps = 1000"]),
         (["skill.preset=baseline", "reward.preset=default"], ["reward.path_distance", "baseline"]),
         (["option.waypoints=12"], ["option.waypoints = 12", "expected 10", "observes"]),
+        (["option.spacing_m=1.5"], ["option.waypoints = 10", "option.spacing_m = 1.5", "15 m", "at most 10 m"]),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(overrides: list[str], parts: list[str]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
-    """Angles wrapped to [-pi, pi) [rad]."""
+    """Angles wrapped to [-pi, pi) [rad]; pi itself where rounding leads there."""
     return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
 
 

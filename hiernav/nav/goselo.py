@@ -83,7 +83,8 @@ def images(
     """GOSELO images of N robots: (N, C, 64, 64) uint8.
 
     A channel is named after what it shows and its crop. `obstacles`: 255 where occupied, as everything outside the
-    map is. `visits`: 255 where the robot came `VISIT_CLIP` times. `clearance`: 255 at `CLEARANCE_CLIP` and beyond.
+    map is. `visits`: brightest where the robot came `VISIT_CLIP` times. `clearance`: 255 at `CLEARANCE_CLIP` and
+    beyond.
     Row 0 is the top (towards the goal), column 0 the left.
 
     Raises:

@@ -108,7 +108,9 @@ def signed_progress(points: np.ndarray, line: np.ndarray, lookahead: float = 0.5
 
     The value is a function of position alone: over any closed motion its changes sum to zero. If the line is a shortest
     path it is also at most what the way to the goal has become shorter (triangle inequality), so not even a motion that
-    provokes new plans on its way earns more than it came nearer to the goal.
+    provokes new plans on its way earns more than it came nearer to the goal. A path that keeps off obstacles is not a
+    shortest one: with a lookahead, loops that provoke new plans may then earn some centimetres, which the cost of time
+    has to outweigh.
 
     Args:
         points: (N, 2) [m].

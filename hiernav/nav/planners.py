@@ -229,7 +229,7 @@ class VerifiedPlanner:
         reached = np.flatnonzero(np.linalg.norm(plan - query.goal[row], axis=-1) <= self.goal_radius)
         driven = plan[: reached[0] + 1] if len(reached) else plan
         field = self.repair.field(query.occupancy[row], query.goal[row])
-        here, there = field.distance_at(np.stack([query.position[row], driven[-1]])).tolist()
+        here, there = field.way_from(query.position[row]), field.way_from(driven[-1])
         length = arc_lengths(polyline(query.position[row][None], driven[None]))[0, -1]
         # less a cell, which is how exactly the way is known; where there is none, inf - inf speaks for no plan
         return here - there < self.least_gain * float(length) - CELL

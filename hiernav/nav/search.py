@@ -70,6 +70,9 @@ class PathField:
         self._cost, self._next = np.full(len(self._free), np.inf), np.full(len(self._free), -1)
         self.goal_cell = _nearest(self._centers, self._free, self.goal)
         self._end = self.goal
+        # a goal far from all that is free is not looked for on the long way there
+        if self.goal_cell is not None and not self._near_goal(goal_reach + 2.0 * CELL):
+            self.goal_cell = None
         if self.goal_cell is not None:
             self._end = self._nearest_end(self._centers[self.goal_cell])
             if not np.linalg.norm(self._end - self.goal) <= goal_reach:
@@ -88,6 +91,15 @@ class PathField:
     def distance_at(self, points: np.ndarray) -> np.ndarray:
         """Cost to go [m] of the cells that (M, 2) points lie in; inf where no path starts."""
         return self._cost[self._cells(points)]
+
+    def way_from(self, start: np.ndarray) -> float:
+        """Cost to go [m] of a path from a start (2,), its way to the cell where that begins included; inf for none."""
+        start = np.asarray(start, dtype=np.float64)
+        own = int(self._cells(start[None])[0])
+        cell = self._entry_for(start, own)
+        if cell is None or cell == own:
+            return float(self._cost[own])
+        return float(self._cost[cell] + np.linalg.norm(self._centers[cell] - start))
 
     def path_from(self, start: np.ndarray, max_vertices: int | None = None) -> np.ndarray | None:
         """Vertices (K, 2) from a start to the goal, both included; None if there is no path.
@@ -164,6 +176,11 @@ class PathField:
             here = following
             kept.append(path[here])
         return np.array(kept)
+
+    def _near_goal(self, reach: float) -> bool:
+        """Whether the goal's cell has its centre within `reach` [m] of the goal; True where that is not finite."""
+        apart = np.linalg.norm(self._centers[self.goal_cell] - self.goal)
+        return not apart > reach or not np.isfinite(apart)
 
     def _nearest_end(self, center: np.ndarray) -> np.ndarray:
         """The goal, or where the disc cannot get to it from `center` (2,) the last point on the way where it can."""

@@ -64,10 +64,11 @@ class WorldRange:
         return self._fixed or self._world([each.draw(rng) for each in self._ranges])
 
     def extremes(self) -> tuple[WorldSpec, ...]:
-        """The smallest and the largest world; the same one where nothing is a range."""
+        """The smallest world, the largest, and the smallest with most in it; one alone where nothing is a range."""
         if self._fixed is not None:
             return (self._fixed,)
-        return self._world([r.low for r in self._ranges]), self._world([r.high for r in self._ranges])
+        low, high = [each.low for each in self._ranges], [each.high for each in self._ranges]
+        return self._world(low), self._world(high), self._world([*low[:2], *high[2:]])
 
     def _world(self, values: list[float]) -> WorldSpec:
         sides = [round(value / _SIZE_STEP) * _SIZE_STEP for value in values[:2]]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hiernav.config import TrainConfig
+from hiernav.config import ConfigError, TrainConfig
 from hiernav.nav.observation import ObservationLayout, observation_layout
 from hiernav.nav.option import Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
@@ -38,7 +38,12 @@ class RandomLayouts:
 
 def expert_planner(config: TrainConfig) -> ShortestPathPlanner:
     """The shortest-path planner with the radius and margin of a configuration."""
-    radius = config.planner.planning_radius_m or get_robot(config.robot).radius
+    least = get_robot(config.robot).radius
+    radius = config.planner.planning_radius_m or least
+    if radius < least:
+        raise ConfigError(
+            f"planner.planning_radius_m = {radius:g}, expected at least {least:g}, the radius of the {config.robot}"
+        )
     return ShortestPathPlanner(
         radius, config.planner.soft_margin_m, num_waypoints=config.option.waypoints, spacing=config.option.spacing_m
     )

@@ -81,6 +81,8 @@ class NavigationGymEnv(gymnasium.Env):
         if self.render_mode is None:
             return None
         layout, pose = self.task.layouts[0], self.task.pose[0]
+        if layout is None:
+            raise gymnasium.error.ResetNeeded("render() before reset(): there is no world yet")
         return draw_from_above(
             layout, float(self.task.sim.time[0]), pose, self.task.robot.radius, self.task.option.plan[0]
         )

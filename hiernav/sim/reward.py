@@ -64,7 +64,7 @@ def count_progress(before: np.ndarray, after: np.ndarray, vertices: np.ndarray) 
 
 
 def signed_progress(before: np.ndarray, after: np.ndarray, line: np.ndarray, lookahead: float) -> np.ndarray:
-    """Progress along the plan (N,) [m], signed before its first vertex: closed motions earn nothing."""
+    """Progress along the plan (N,) [m], signed before its first vertex: on one plan, closed motions earn nothing."""
     ends, lines = np.concatenate([before, after]), np.concatenate([line, line])
     begin, end = path.signed_progress(ends, lines, lookahead).reshape(2, -1)
     return end - begin

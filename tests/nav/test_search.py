@@ -12,6 +12,7 @@ from nav_planners import map_with_pillars, pillar_world
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
+from hiernav.nav.path import arc_lengths
 from hiernav.nav.search import CELL, LEAD, PathField, is_solvable, random_shortcuts, resample
 from hiernav.sim.worlds import parse_world, sample_layout
 
@@ -172,6 +173,31 @@ def test_a_start_in_or_too_close_to_an_obstacle_is_led_out_of_it(angle: float, d
 def test_a_start_outside_the_map_is_led_in() -> None:
     field = PathField(map_with_pillars(half_size=(2.0, 2.0)), np.zeros(2), RADIUS)
     assert_allclose(field.path_from(np.array([2.3, 0.4]))[[0, -1]], [[2.3, 0.4], [0.0, 0.0]])
+
+
+def test_the_way_of_a_start_whose_own_cell_lacks_room_counts_from_where_it_is_led() -> None:
+    occupancy = map_with_pillars([(0.0, 0.0), (1.0, 0.3), (-0.7, 0.5)])
+    field, rng = PathField(occupancy, np.array([1.7, -1.6]), 0.1), np.random.default_rng(0)
+    starts = rng.uniform(-1.8, 1.8, (4000, 2))
+    led = starts[np.isinf(field.distance_at(starts)) & (occupancy.clearance_at(starts) >= 0.1)]
+    assert len(led) > 10
+    for start in led:
+        line = field.path_from(start)
+        way = field.way_from(start)
+        assert np.isfinite(way) == (line is not None)
+        if line is not None:
+            assert way == pytest.approx(arc_lengths(line[None])[0, -1], abs=0.15)
+    assert field.way_from(np.array([-1.0, -1.0])) == field.distance_at(np.array([[-1.0, -1.0]]))[0]
+
+
+def test_a_goal_far_outside_is_blocked_without_a_search_on_the_way_there(monkeypatch) -> None:
+    def search(*_: object) -> None:
+        raise AssertionError("the long way to the goal was looked at")
+
+    monkeypatch.setattr(PathField, "_nearest_end", search)
+    field = PathField(map_with_pillars(), np.array([3e5, 0.0]), 0.1)
+    assert field.goal_cell is None
+    assert field.refusal(np.zeros(2)) == "goal_blocked"
 
 
 def test_at_the_goal_the_plan_stays_there() -> None:

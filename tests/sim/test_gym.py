@@ -150,6 +150,13 @@ def test_pictures_of_every_control_step_are_shown_at_the_robot_s_rate(robot: str
     assert NavigationGymEnv.metadata["render_modes"] == ["rgb_array"]
 
 
+def test_there_is_no_picture_before_the_first_reset() -> None:
+    env = gymnasium.make("hiernav/PointPillar-v0", render_mode="rgb_array", disable_env_checker=True).unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded, match="no world yet"):
+        env.render()
+    env.close()
+
+
 def test_without_a_render_mode_there_is_no_picture_and_an_unknown_one_is_refused() -> None:
     env = NavigationGymEnv()
     env.reset(seed=0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from small_tasks import WORLD
 
-from hiernav.config import TrainConfig, load_config
+from hiernav.config import ConfigError, TrainConfig, load_config
 from hiernav.sim.factory import RandomLayouts, expert_planner, make_task, replan_rule
 from hiernav.sim.layout import parse_world
 from hiernav.sim.task import NavigationTask
@@ -110,6 +111,8 @@ def test_the_task_is_built_as_configured() -> None:
     planner = expert_planner(config)
     assert (planner.radius, planner.soft_margin) == (0.2, 0.05)
     assert expert_planner(load_config(None, ["planner.planning_radius_m=0.15"])).radius == 0.15
+    with pytest.raises(ConfigError, match=r"planning_radius_m = 0.04, expected at least 0.1, the radius of the point"):
+        expert_planner(load_config(None, ["planner.planning_radius_m=0.04"]))
 
 
 def test_a_random_world_is_reset_into_the_drawn_layout() -> None:
