@@ -17,15 +17,6 @@ import pytest
 from scripted_robot import write_adapter
 from shipped import RUN_LOOP
 
-
-@pytest.fixture(autouse=True)
-def hangups_are_obeyed():
-    """Also where the tests run under nohup, which what they start would inherit."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
 PROGRAM = textwrap.dedent(
     """
     import sys, time
