@@ -234,6 +234,8 @@ def _process_robot(
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.episodes < 1:
         raise ValueError(f"--episodes is {arguments.episodes}, it must be at least 1")
+    if arguments.seed < 0:
+        raise ValueError(f"--seed {arguments.seed}, it must not be negative")
     view = arguments.view is not None
     if arguments.fast and (arguments.serve or view or arguments.adapter or arguments.planner == "process"):
         raise ValueError("--fast has no real time: it goes with none of --serve, --view, --adapter, --planner process")
@@ -390,8 +392,8 @@ class Episodes:
     def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
         """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""
         code = OK
-        if any(episode.result.refused for episode in episodes):
-            code = BAD_GOAL
+        if not self.arguments.serve and any(episode.result.refused for episode in episodes):
+            code = BAD_GOAL  # who serves was asked for many goals, and told of each
         if self.failed or self.driver.gone or any(episode.result.fault for episode in episodes):
             code = FAULT
         for observer in filter(None, (self.recorder, self.page)):

@@ -345,6 +345,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from hiernav.evaluate import EPISODES, evaluate, open_policies
 
     worlds = _worlds(arguments)
+    if arguments.json and arguments.json != "-" and Path(arguments.json).is_dir():
+        raise ValueError(f"--json {arguments.json} is a folder, it must be a file")
     policies = open_policies(arguments.bundle or arguments.run_path)
     robot = policies.config.robot
     if arguments.robot and arguments.robot != robot:
@@ -399,6 +401,8 @@ def _watch(arguments: argparse.Namespace) -> int:
     planner = arguments.planner or ("cnn" if policies.network is not None else "astar")
     if arguments.planner is None and planner == "astar" and not policies.is_baseline:
         print(f"{source} has no planner network yet: the shortest-path planner plans", file=sys.stderr)
+    if arguments.out and arguments.out.suffix not in SUFFIXES and arguments.out.suffix[1:].isalpha():
+        raise ValueError(f"--out {arguments.out}: the name of a film must end in {' or '.join(SUFFIXES)}")
     out = arguments.out or (Path("runs/films") if arguments.bundle else source / "films")
     if out.suffix not in SUFFIXES:
         films = {world: out / f"{film_name(world)}{default_suffix()}" for world in worlds}

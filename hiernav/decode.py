@@ -148,6 +148,8 @@ def _type_text(kind: types.Type) -> str:
             return " | ".join(map(str, kind.values))
         case types.BoolType():
             return "true | false"
+        case types.TupleType():
+            return f"list of {len(kind.item_types)}: {_type_text(kind.item_types[0])}"
         case types.VarTupleType() | types.ListType():
             least = f"at least {kind.min_length} of: " if kind.min_length else ""
             return f"list of {least}{_type_text(kind.item_type)}"

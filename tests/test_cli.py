@@ -211,6 +211,7 @@ def test_a_bundle_that_must_not_be_used_is_refused(refused, able_bundle, tmp_pat
     line = refused("evaluate", "--bundle", able_bundle, "--robot", "car")
     assert "these policies are for robot 'point', not 'car'" in line
     assert "episodes must be at least 1, got 0" in refused("evaluate", "--bundle", able_bundle, "--episodes", 0)
+    assert "--json . is a folder" in refused("evaluate", "--bundle", able_bundle, "--json", ".")
 
 
 def test_a_world_is_drawn_and_the_seed_decides_it(tmp_path, capsys):

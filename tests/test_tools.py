@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
         (["noise_table.py", "--bundle", "/nope"], "noise_table: /nope: no such folder"),
         (["training_race.py", "--config", "/nope"], "training_race: /nope: cannot be read"),
         (["bench.py", "--tick", "--bundle", "/nope"], "bench: /nope: no such folder"),
+        (["bench_loop.py", "--rate", "50", "--seconds", "nan"], "bench_loop: --seconds is nan, it must be at least 1"),
     ],
 )
 def test_bad_input_is_one_line(command, line):

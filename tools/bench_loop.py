@@ -39,6 +39,8 @@ def main() -> int:
     parser.add_argument("--normal", action="store_true", help="ask for no real-time scheduling")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
+    if not 1.0 <= arguments.seconds < float("inf"):
+        raise ValueError(f"--seconds is {arguments.seconds:g}, it must be at least 1")
     if arguments.rate is None:
         found = bench_loop(arguments.bundle, arguments.normal)
     else:

@@ -215,6 +215,7 @@ def test_the_newest_run_is_watched_and_the_shortest_path_plans_where_no_network_
         (["runs/able", "--planner", "cnn"], "train the planner first, or use --planner astar"),
         (["runs/able", "--bundle", "bundle"], "a run and a bundle at once"),
         (["runs/able", "--world", "gremlin", "--world", "two-room", "--out", "a.mp4"], "a.mp4 is one film"),
+        (["runs/able", "--out", "a.avi"], "--out a.avi: the name of a film must end in .mp4 or .gif"),
         (["runs/able", "--size", "9"], "size is 9, it must be 200 to 2000"),
         (["runs/able", "--episodes", "0"], "episodes must be at least 1, got 0"),
         (["runs/none"], "runs/none: no such folder"),

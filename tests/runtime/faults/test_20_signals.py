@@ -17,6 +17,8 @@ import pytest
 from scripted_robot import write_adapter
 from shipped import RUN_LOOP
 
+from hiernav.runtime.control import tell
+
 PROGRAM = textwrap.dedent(
     """
     import sys, time
@@ -85,6 +87,24 @@ def test_the_command_line_ends_with_code_0_and_its_summary(tmp_path, number):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert json.loads((out / "summary.json").read_text())["timing"]["ticks"] > 0
+
+
+def test_who_serves_ends_with_code_0_although_a_goal_was_refused(tmp_path):
+    socket, out = tmp_path / "socket", tmp_path / "out"
+    command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(socket), "--no-pictures"]
+    process = subprocess.Popen(
+        [*command, "--planner", "sync", "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert "ready for goals" in process.stdout.readline()
+    tell(socket, "goal 100,100")
+    end = time.monotonic() + 30.0
+    while (last := tell(socket, "status")["last"]) is None and time.monotonic() < end:
+        time.sleep(0.05)
+    assert last["reason"] == "goal_outside"
+    tell(socket, "quit")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
