@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hiernav.config import (
+    LONGEST_PLAN,
     PRESETS,
     ConfigError,
     OptionConfig,
@@ -25,6 +26,7 @@ from hiernav.config import (
     load_config,
 )
 from hiernav.nav.observation import observation_layout
+from hiernav.nav.option import WaypointOption
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 SECTIONS = {"planner": PlannerConfig, "skill": SkillConfig, "option": OptionConfig, "reward": RewardConfig}
@@ -368,3 +370,7 @@ def test_the_floor_of_the_temperature_falls_forwards() -> None:
 def test_a_baseline_has_no_planner_network_to_follow() -> None:
     with pytest.raises(ConfigError, match="skill.planner = 'cnn', expected 'astar'"):
         load_config(None, ["skill.preset=baseline", "skill.planner=cnn"])
+
+
+def test_the_longest_plan_of_a_configuration_is_what_an_option_follows() -> None:
+    assert LONGEST_PLAN == WaypointOption.max_reach
