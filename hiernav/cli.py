@@ -165,6 +165,7 @@ def _parser() -> argparse.ArgumentParser:
         "--no-repair", action="store_true", help="drive the network's plans even if they collide (cnn only)"
     )
     evaluate.add_argument("--no-recovery", action="store_true", help="let a robot that stands still stand")
+    evaluate.add_argument("--no-prediction", action="store_true", help="plan on maps as they are, not as they will be")
     evaluate.add_argument("--episodes", type=int, metavar="N", help="per world (protocol's number)")
     evaluate.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
     evaluate.add_argument("--json", metavar="FILE", help="write the results, an object per world; - for the screen")
@@ -372,6 +373,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             repair=not arguments.no_repair,
             on_episode=show,
             recover=not arguments.no_recovery,
+            predict=not arguments.no_prediction,
         )
     if arguments.json == "-":
         print(json.dumps(results, indent=2))

@@ -101,12 +101,14 @@ def evaluate(
     rows: int = 64,
     on_episode: Callable[[str, int, Episode], None] | None = None,
     recover: bool = True,
+    predict: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Metrics of every world, by its name; the same for the same seed, whatever `rows` is.
 
     Beside `summarize`, a row says what helped: `repair` (plans of the network were verified), `recover` (a robot that
-    stands still got a way out; never one whose skill follows no waypoints), and the rule of replanning (`period`,
-    `invalid`). `return_mean` is null where the reward is not known, as that of a bundle.
+    stands still got a way out; never one whose skill follows no waypoints), `predict` (plans were made on maps as they
+    will be), and the rule of replanning (`period`, `invalid`). `return_mean` is null where the reward is not known, as
+    that of a bundle.
 
     Args:
         protocol: "paper" or "strict".
@@ -115,6 +117,7 @@ def evaluate(
         repair: see `make_planner`.
         rows: simulations side by side.
         recover: see `run_episodes`.
+        predict: see `WaypointOption`.
     """
     if protocol not in EPISODES:
         raise ValueError(f"unknown protocol {protocol!r}; known: {', '.join(EPISODES)}")
@@ -128,6 +131,7 @@ def evaluate(
         radius = get_robot(policies.config.robot).radius
         layouts = [sample_layout(world, int(s), radius) for s in episode_seeds(seed, count)]
         task = make_task(policies.config, min(rows, count), plan, [world])
+        task.option.predict = predict and not policies.is_baseline
         began = time.perf_counter()
         report = None if on_episode is None else partial(on_episode, name)
         done = run_episodes(task, policies.skill, layouts, report, recover=recover)
@@ -138,6 +142,7 @@ def evaluate(
             "protocol": protocol,
             **_planned_by(policies, planner, plan),
             "recover": task.recovery is not None,
+            "predict": task.option.predict,
             "period": policies.config.option.period,
             "invalid": policies.config.option.invalid,
             "seed": seed,

@@ -328,7 +328,7 @@ def test_a_run_and_its_bundle_are_evaluated(able_run, able_bundle, tmp_path, cap
     assert ours["reach_ci95"] == list(wilson_interval(round(5 * ours["reach_rate"]), 5))
     wanted = {
         "reach_rate", "reach_ci95", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean", "episodes",
-        "replans", "spl_unknown", "planner", "repair", "recover", "period", "invalid",
+        "replans", "spl_unknown", "planner", "repair", "recover", "predict", "period", "invalid",
     }  # fmt: skip
     assert all(row.keys() >= wanted for row in from_bundle.values())
     assert isinstance(ours["return_mean"], float) and theirs["return_mean"] is None

@@ -300,7 +300,7 @@ def test_a_run_and_its_bundle_drive_the_same_episodes(able_run: Path, able_bundl
         row = evaluate(open_policies(source), [WORLD], planner=planner, episodes=12, on_episode=keep)[str(WORLD)]
         driven[source] = (
             row["reach_rate"],
-            [row[name] for name in ("planner", "repair", "recover", "period", "invalid", "spl_unknown")],
+            [row[name] for name in ("planner", "repair", "recover", "predict", "period", "invalid", "spl_unknown")],
             [(episodes[k].seed, episodes[k].reached) for k in range(12)],
             np.array([episodes[k].steps for k in range(12)]),
         )

@@ -18,6 +18,7 @@ from hiernav.nav import path
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.observation import ObservationLayout, clock_phase
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.prediction import MapPredictor
 from hiernav.nav.recovery import Recovery
 from hiernav.nav.sweep import meets_map, sweep
 
@@ -186,6 +187,8 @@ class WaypointOption:
     refresh: int | None = None
     """Control steps after which a plan is outdated if it was made on another map than the present one: obstacles that
     move are avoided before they are in the way. None: never."""
+    predict: bool = True
+    """Whether plans are made and swept on maps as they will be (`MapPredictor`), if the time of each step is told."""
     max_reach: float = 10.0
     """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
@@ -205,6 +208,7 @@ class WaypointOption:
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
         self._refresh = np.iinfo(np.int64).max if self.refresh is None else self.refresh
+        self._predictors = [MapPredictor() for _ in range(self.num_rows)]
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
         self._hit = np.zeros(self.num_rows)  # where it meets it last, counted in vertices of the line; 0 if nowhere
 
@@ -217,6 +221,7 @@ class WaypointOption:
         self.waiting[rows] = self._adopted[rows] = False
         for row in rows.tolist():
             self.visits[row] = None
+            self._predictors[row].reset()
 
     def drop(self, rows: np.ndarray | slice | None = None) -> None:
         """Give up the plans of some rows without forgetting the episode, as when the goal has changed.
@@ -255,6 +260,7 @@ class WaypointOption:
         goal: np.ndarray,
         occupancy: Sequence[OccupancyMap],
         rows: np.ndarray | None = None,
+        time_: np.ndarray | None = None,
     ) -> OptionStep:
         """One control step: end the options that are due and plan anew for them.
 
@@ -263,6 +269,7 @@ class WaypointOption:
             goal: (M, 2) world frame [m].
             occupancy: M maps as they are now.
             rows: (M,) the rows these belong to; all N by default.
+            time_: (M,) [s], on any clock; without it no map is predicted.
 
         Returns:
             The step of those M rows.
@@ -271,6 +278,9 @@ class WaypointOption:
         pick: slice | np.ndarray = slice(None) if rows is None else np.asarray(rows)
         rows = self._all_rows[pick]
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+        if self.predict and time_ is not None:
+            at_rows = zip(rows.tolist(), occupancy, time_.tolist(), position, strict=True)
+            occupancy = [self._predictors[row](now, moment, where) for row, now, moment, where in at_rows]
         for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
             if visits is None:
@@ -454,6 +464,7 @@ class HierarchicalAgent:
         terms: Mapping[str, np.ndarray],
         goal: np.ndarray,
         occupancy: Sequence[OccupancyMap],
+        time_: np.ndarray | None = None,
     ) -> AgentStep:
         """One control step.
 
@@ -462,12 +473,14 @@ class HierarchicalAgent:
             terms: the robot's sensors by name, (N, d) each; waypoints and goal are added here.
             goal: (N, 2) world frame [m].
             occupancy: N maps as they are now.
+            time_: (N,) of the maps, on any clock [s]; that of the steps by default.
         """
-        step = self.option.step(pose[:, :2], goal, occupancy)
+        since = self._steps * self.control_period
+        step = self.option.step(pose[:, :2], goal, occupancy, time_=since if time_ is None else time_)
         plan = self.recovery(pose, step.plan, occupancy)
         self.option.waiting |= self.recovery.ended
-        time_ = self._steps * self.control_period if self._clocked else None
-        observation = self.layout.build(guided(self.recovery.dim(terms), pose, plan, goal, time_))
+        guides = guided(self.recovery.dim(terms), pose, plan, goal, since if self._clocked else None)
+        observation = self.layout.build(guides)
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
 

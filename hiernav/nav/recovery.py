@@ -25,10 +25,11 @@ _DIMMED = 0.7
 class Recovery:
     """Gives robots that should move and do not a way out.
 
-    A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away. It is
-    then shown one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as
-    long again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each
-    without coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
+    A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away; where
+    the map has changed meanwhile, within `patience_s`: it may wait for what is in its way to move on. It is then shown
+    one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as long
+    again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each without
+    coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
 
     Each way leads from where the robot is at its turn. It is swept on the newest map at every step and ends before what
     it meets; if that is near, the turn is the next free one's. A robot that is free to no side is asked to stay.
@@ -46,6 +47,7 @@ class Recovery:
         control_period: float,
         radius: float = 0.1,
         window_s: float = 1.5,
+        patience_s: float = 4.0,
         least_m: float = 0.05,
         try_s: float = 0.5,
         ways: int = 6,
@@ -57,8 +59,11 @@ class Recovery:
         self.radius, self.least_m, self.reach_m, self.limit, self.clear_m = radius, least_m, reach_m, limit, clear_m
         self.ways = ways
         self._try = max(1, round(try_s / control_period))
-        self._trail = np.full((num_rows, max(1, round(window_s / control_period)), 2), np.nan)
+        self._window = max(1, round(window_s / control_period))
+        self._trail = np.full((num_rows, max(self._window, round(patience_s / control_period)), 2), np.nan)
         self._tick = np.zeros(num_rows, dtype=np.int64)
+        self._map: list[OccupancyMap | None] = [None] * num_rows
+        self._mapped = np.zeros(num_rows, dtype=np.int64)  # the tick of the newest map
         self._on_way = np.zeros(num_rows, dtype=np.int64)
         self._ways_left = np.zeros(num_rows, dtype=np.int64)
         self._tries = np.zeros(num_rows, dtype=np.int64)
@@ -112,11 +117,16 @@ class Recovery:
             (M, K, 2) world frame [m]; `plan` itself where no robot is on its way out.
         """
         rows = np.arange(len(self.counts)) if rows is None else rows
-        position, slot = pose[:, :2], self._tick[rows] % self._trail.shape[1]
-        self._tick[rows] += 1
+        position, tick, length = pose[:, :2], self._tick[rows], self._trail.shape[1]
+        for row, at_tick, now in zip(rows.tolist(), tick.tolist(), occupancy, strict=True):
+            if self._map[row] is not now:
+                self._map[row], self._mapped[row] = now, at_tick
+        patient = self._mapped[rows] > tick - self._window
+        since = np.where(patient, tick, tick - self._window) % length  # the slot that is written next is the oldest
         # comparisons with NaN, where the window is not full or a position unknown, are False
-        still = distances(position, self._trail[rows, slot]) < self.least_m
-        self._trail[rows, slot] = position
+        still = distances(position, self._trail[rows, since]) < self.least_m
+        self._trail[rows, tick % length] = position
+        self._tick[rows] += 1
         if self._quiet and not np.count_nonzero(still):
             return plan
         self._forget(rows, position)

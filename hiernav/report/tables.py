@@ -39,7 +39,8 @@ VARIANTS = {
 }
 WHAT = {
     "no-repair": "plans are not verified or repaired", "no-recovery": "a robot that stands still gets no way out",
-    "no-invalid-rule": "plans that meet the map are kept", "paper-reward": "the paper's reward",
+    "no-invalid-rule": "plans that meet the map are kept",
+    "no-prediction": "plans are made on maps as they are, not as they will be", "paper-reward": "the paper's reward",
     "one-world": "trained in pillar(2,2,10) alone, as in the paper", "no-phase-in": "all worlds from the start",
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
     "no-alpha-floor": "no floor of the temperature", "no-tilt-cost": "no cost of tilting",

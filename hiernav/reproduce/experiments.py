@@ -64,6 +64,7 @@ FILM_SECONDS = 15.0
 DRIVING = {
     "no-repair": {"repair": False},
     "no-recovery": {"recover": False},
+    "no-prediction": {"predict": False},
     "no-invalid-rule": {"invalid": False},
 }
 """Departures that evaluation can switch off: settings that differ."""

@@ -135,7 +135,8 @@ def driven(
     The paper's episodes are the first ones of the strict protocol's, so they are driven once.
 
     Args:
-        settings: `episodes`, and what differs: `paper_episodes`, `planner`, `repair`, `recover`, `period`, `invalid`.
+        settings: `episodes`, and what differs: `paper_episodes`, `planner`, `repair`, `recover`, `predict`,
+            `period`, `invalid`.
         reward: to measure returns by, instead of the one the policies were trained with. Without it, returns of a
             bundle, which does not tell its reward, are null.
     """
@@ -162,13 +163,14 @@ def driven(
         settings.get("repair", True),
         on_episode=keep,
         recover=settings.get("recover", True),
+        predict=settings.get("predict", True),
     )[str(spec)]
     found.pop("seconds")
     done = [episodes[number] for number in sorted(episodes)]
     metrics = {"strict": {**found, **_more(done)}}
     if count := settings.get("paper_episodes"):
         counted = under_protocol(done[:count], "paper", spec)
-        helped = {name: found[name] for name in ("planner", "repair", "recover", "period", "invalid")}
+        helped = {name: found[name] for name in ("planner", "repair", "recover", "predict", "period", "invalid")}
         metrics["paper"] = {**helped, **summarize(counted, policies.knows_reward), **_more(counted)}
     return metrics
 

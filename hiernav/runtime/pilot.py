@@ -216,7 +216,7 @@ class Pilot:
         option, refusals = self.agent.option, int(self.agent.option.refused[0])
         answered = self._take_answer(now, estimate.stamp)
         pose = estimate.pose[None]
-        step = self.agent.act(pose, terms, goal[None], (occupancy,))
+        step = self.agent.act(pose, terms, goal[None], (occupancy,), np.array([estimate.stamp]))
         replanned = bool(step.replanned[0])
         if replanned:
             self._plan_stamp = answered if answered is not None else estimate.stamp

@@ -176,7 +176,8 @@ class Replay:
             if tick.replanned:
                 yield from self._answer(tick, self._asked)
         self._recovery.plan = tick.plan if tick.recovering else None
-        step = self._agent.act(tick.estimate.pose[None], terms, tick.goal[None], (tick.occupancy,))
+        pose, stamp = tick.estimate.pose[None], np.array([tick.estimate.stamp])
+        step = self._agent.act(pose, terms, tick.goal[None], (tick.occupancy,), stamp)
         yield "reason", int(tick.reason), int(step.reason[0])
         yield "plan", tick.plan, step.plan[0]
         yield "observation", tick.observation, step.observation[0]

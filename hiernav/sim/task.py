@@ -178,7 +178,7 @@ class NavigationTask:
         maps = self._maps if rows is None else [self._maps[row] for row in rows]
         pick = slice(None) if rows is None else rows  # of all rows no copy is made
         pose, goal = self.sim.pose[pick], self.goal[pick]
-        option = self.option.step(pose[:, :2], goal, maps, rows)
+        option = self.option.step(pose[:, :2], goal, maps, rows, self.sim.time[pick])
         plan = option.plan
         if self.recovery is not None:
             plan = self.recovery(pose, plan, maps, rows)

@@ -35,6 +35,15 @@ def test_a_robot_that_stands_is_shown_one_way_out_after_the_other_and_is_then_wa
     assert recovery.counts.tolist() == [2]
 
 
+@pytest.mark.parametrize(("changes", "begins"), [(1, 40), (15, 40), (16, 15), (1000, 15)])
+def test_where_the_map_changes_a_robot_may_wait_longer(changes: int, begins: int) -> None:
+    """Not before 1.5 s on one map, and after 4 s in any case."""
+    recovery, maps = Recovery(1, PERIOD), [empty_map((3.0, 3.0)) for _ in range(60)]
+    poses = np.zeros((1, 3))
+    helped = [recovery(poses, AHEAD, [maps[t // changes]]) is not AHEAD for t in range(45)]
+    assert helped.index(True) == begins
+
+
 def test_the_way_on_which_it_moves_is_followed_for_as_long_again_and_is_the_last() -> None:
     recovery, ways = Recovery(1, PERIOD), []
     for t in range(WINDOW + DURATION):
