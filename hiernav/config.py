@@ -179,7 +179,7 @@ class OptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         0.3
     )
     half_fraction: Annotated[float, Meta(gt=0, le=1, description="Replan once this part of the plan is used up.")] = 0.5
-    invalid: Annotated[bool, Meta(description="Replan when the rest of the plan meets the current map.")] = True
+    invalid: Annotated[bool, Meta(description="Replan when the rest of the plan meets the map.")] = True
     period: Annotated[
         Annotated[int, Meta(ge=1)] | None,
         Meta(description="Replan every so many steps instead of by rule; null: by rule."),

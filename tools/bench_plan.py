@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from race import race, timed, typical
 
 WORLD = "pillar(2,2,10)"
+MOVING_WORLD = "gremlin"
+
+if TYPE_CHECKING:
+    from hiernav.nav.occupancy import OccupancyMap
 
 
 def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -66,10 +72,43 @@ def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
         count, seconds = timed(run, arguments.seconds / 4)
         results[name] = seconds / count
         print(f"plan {name:12s} {1e3 * seconds / count:7.3f} ms   {count / seconds:8,.0f}/s")
+    results |= bench_prediction()
     # a hundred samples share a field
     bare = results["field"] / 100 + results["waypoints"] + results["image"]
     print(f"plan samples/s beside bare field / 100, waypoints and image: {bare / results['sample']:.2f}")
     return {**results, "sample_ratio": bare / results["sample"]}
+
+
+def bench_prediction(period: float = 0.1, seconds: float = 4.0, episodes: int = 100) -> dict[str, Any]:
+    """What a prediction of a map costs, and how far from what moves it draws it, once that has been watched."""
+    from hiernav.nav.prediction import AHEAD_S, WINDOW_S, MapPredictor
+    from hiernav.sim.layout import parse_world
+    from hiernav.sim.worlds import sample_layout
+
+    errors, spent, count = [], 0.0, 0
+    for seed in range(episodes):
+        layout, predictor = sample_layout(parse_world(MOVING_WORLD), seed), MapPredictor()
+        for now in np.arange(0.0, seconds, period).tolist():
+            occupancy = layout.occupancy(now)
+            began = time.perf_counter()
+            ahead = predictor(occupancy, now, layout.start[:2])
+            spent, count = spent + time.perf_counter() - began, count + 1
+            if now > WINDOW_S:
+                errors += [_off_centre(ahead, point) for point in layout.gremlin_positions(now + AHEAD_S)]
+    half, most = np.percentile(errors, [50, 90]).tolist()
+    print(
+        f"plan {'prediction':12s} {1e3 * spent / count:7.3f} ms   {100 * half:.1f} cm from where a gremlin will be, "
+        f"{100 * most:.1f} cm in one of ten"
+    )
+    return {"prediction": spent / count, "prediction_error": half, "prediction_error_90": most}
+
+
+def _off_centre(occupancy: OccupancyMap, point: np.ndarray) -> float:
+    """How far [m] from a point (2,) the middle of the obstacle is that is drawn there; inf if there is none."""
+    labels, _, centers = cv2.connectedComponentsWithStats(occupancy.occupied.view(np.uint8), connectivity=4)[1:]
+    label = int(labels[occupancy.pixel_of(point)])
+    at = np.array(occupancy.origin) + (centers[label] + 0.5) * occupancy.resolution
+    return float(np.linalg.norm(at - point)) if label else np.inf
 
 
 def bench_learn(arguments: argparse.Namespace) -> dict[str, Any]:

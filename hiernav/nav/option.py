@@ -58,7 +58,7 @@ class ReplanRule:
     half_fraction: float = 0.5
     """Share of the waypoints behind the robot above which the plan is used up."""
     invalid: bool = True
-    """Whether a plan is given up whose rest meets the current map, or that is old and was made on another map (beyond
+    """Whether a plan is given up whose rest meets the map, or that is old and was made on another map (beyond
     the paper)."""
     period: int | None = None
     """Replan every so many steps instead of by distance and index (the paper's comparison)."""

@@ -52,9 +52,9 @@ def test_a_robot_that_gets_free_goes_on():
 
 def test_a_way_out_ends_after_half_a_metre_however_fast():
     recovery, plan = Recovery(1, 0.1, try_s=10.0, limit=1), np.full((1, 10, 2), 0.9)
-    pose, moved = np.zeros((1, 3)), []
+    pose, moved, occupancy = np.zeros((1, 3)), [], empty_map((2.0, 2.0))
     for _ in range(30):
-        if recovery(pose, plan, [empty_map((2.0, 2.0))]) is not plan:
+        if recovery(pose, plan, [occupancy]) is not plan:
             pose = pose + [[0.12, 0.0, 0.0]]
         moved.append(pose[0, 0])
     assert 0.5 <= max(moved) <= 0.75
