@@ -346,6 +346,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from hiernav.evaluate import EPISODES, evaluate, open_policies
 
     worlds = _worlds(arguments)
+    if arguments.no_repair and arguments.planner == "astar":
+        raise ValueError("--no-repair is for plans of the network, with --planner astar there are none")
     if arguments.json and arguments.json != "-" and Path(arguments.json).is_dir():
         raise ValueError(f"--json {arguments.json} is a folder, it must be a file")
     policies = open_policies(arguments.bundle or arguments.run_path)

@@ -211,6 +211,8 @@ def test_a_bundle_that_must_not_be_used_is_refused(refused, able_bundle, tmp_pat
     line = refused("evaluate", "--bundle", able_bundle, "--robot", "car")
     assert "these policies are for robot 'point', not 'car'" in line
     assert "episodes must be at least 1, got 0" in refused("evaluate", "--bundle", able_bundle, "--episodes", 0)
+    line = refused("evaluate", "--bundle", able_bundle, "--planner", "astar", "--no-repair")
+    assert "--no-repair is for plans of the network, with --planner astar there are none" in line
     assert "--json . is a folder" in refused("evaluate", "--bundle", able_bundle, "--json", ".")
 
 

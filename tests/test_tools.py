@@ -39,6 +39,29 @@ def test_bad_input_is_one_line(command, line):
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("command", "line"),
+    [
+        (["bench.py", "--seconds", "nan"], "bench.py: error: argument --seconds: nan, it must be finite and above 0"),
+        (["planner_scale.py", "--worlds", "0"], "planner_scale.py: error: argument --worlds: 0, it must be at least 1"),
+        (["planner_table.py", "--seeds", "-1"], "planner_table.py: error: argument --seeds: -1, it must be at least 0"),
+        (["noise_table.py", "--workers", "0"], "noise_table.py: error: argument --workers: 0, it must be at least 1"),
+        (["training_race.py", "--every", "x"], "training_race.py: error: argument --every: invalid number value: 'x'"),
+    ],
+)
+def test_bad_numbers_are_named(command, line):
+    script, *arguments = command
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tools" / script), *arguments],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines()[-1] == line
+
+
 def tool(name: str):
     spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)

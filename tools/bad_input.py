@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
 from collections.abc import Callable
 
@@ -15,3 +17,23 @@ def exit_code(tool: str, main: Callable[[], int]) -> int:
     except (ValueError, OSError) as error:
         print(f"{tool}: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
+
+
+def whole(least: int = 1) -> Callable[[str], int]:
+    """Type of an option that takes whole numbers, none below `least`."""
+
+    def number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value}, it must be at least {least}")
+        return value
+
+    return number
+
+
+def positive(text: str) -> float:
+    """Type of an option that takes finite numbers above 0."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}, it must be finite and above 0")
+    return value

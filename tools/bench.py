@@ -24,6 +24,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bad_input import exit_code, positive, whole
 from bench_env import bench_env
 from bench_loop import bench_loop
 from bench_plan import bench_learn, bench_plan
@@ -37,9 +38,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in PARTS:
         parser.add_argument(f"--{name}", action="store_true", help=f"only the parts that are named: {name}")
-    parser.add_argument("--seconds", type=float, default=4.0, help="spent on each figure (4)")
-    parser.add_argument("--threads", type=int, default=1, help="for physics and torch (1)")
-    parser.add_argument("--hidden", type=int, default=256, help="width of both hidden layers, for --update and --peers")
+    parser.add_argument("--seconds", type=positive, default=4.0, help="spent on each figure (4)")
+    parser.add_argument("--threads", type=whole(), default=1, help="for physics and torch (1)")
+    parser.add_argument("--hidden", type=whole(), default=256, help="of both layers, for --update and --peers (256)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the updates, for --peers (cpu)")
     parser.add_argument("--peer-python", default=sys.executable, metavar="PATH", help="that the peers are installed in")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="for --tick and --plan")
@@ -101,6 +102,4 @@ BENCHES: dict[str, Callable[[argparse.Namespace], Any]] = {
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("bench", main))

@@ -34,6 +34,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from bad_input import exit_code, whole  # noqa: E402
+
 from hiernav.nav.bundle import Bundle, load_bundle  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap  # noqa: E402
 from hiernav.nav.option import PlanQuery, kept  # noqa: E402
@@ -229,11 +231,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path, metavar="FILE", help="results (runs/noise_table-ROBOT.json)")
     parser.add_argument("--bundle", type=Path, default=ROOT / "deploy/bundles/point", help="whose robot drives (point)")
     parser.add_argument("--world", default="pillar(2,2,10)", help="kind of world (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=200, help="worlds of each row (200)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first world (0)")
+    parser.add_argument("--episodes", type=whole(), default=200, help="worlds of each row (200)")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the first world (0)")
     parser.add_argument("--factorial", action="store_true", help="every combination")
     parser.add_argument("--untold", action="store_true", help="do not tell the filter of sensors noisier than default")
-    parser.add_argument("--workers", type=int, default=1, help="processes (1)")
+    parser.add_argument("--workers", type=whole(), default=1, help="processes (1)")
     parser.add_argument("--only-print", action="store_true", help="drive nothing")
     arguments = parser.parse_args()
     bundle = load_bundle(arguments.bundle)
@@ -348,6 +350,4 @@ def _print(results: dict[str, Any], rows: list[Case]) -> None:
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("noise_table", main))

@@ -23,6 +23,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bad_input import exit_code, positive, whole
+
 from hiernav.nav.bundle import load_bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
@@ -38,9 +40,11 @@ COLORS = {"cnn": "#2b6cb0", "cnn + verification": "#2f855a", "astar": "#dd6b20"}
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="(deploy/bundles/point)")
-    parser.add_argument("--half-sizes", type=float, nargs="+", default=[2, 4, 8, 16, 32], metavar="M", help="of fields")
-    parser.add_argument("--worlds", type=int, default=8, help="of each size (8)")
-    parser.add_argument("--repeats", type=int, default=3, help="of every plan, the fastest counts (3)")
+    parser.add_argument(
+        "--half-sizes", type=positive, nargs="+", default=[2, 4, 8, 16, 32], metavar="M", help="of fields"
+    )
+    parser.add_argument("--worlds", type=whole(), default=8, help="of each size (8)")
+    parser.add_argument("--repeats", type=whole(), default=3, help="of every plan, the fastest counts (3)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="write a plot")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
@@ -119,6 +123,4 @@ def _plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("planner_scale", main))

@@ -21,6 +21,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from bad_input import exit_code, whole
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 PAPER = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
@@ -29,13 +31,15 @@ PAPER = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/planner_table"), help="folder of runs and results")
-    parser.add_argument("--samples", type=int, nargs="+", default=list(PAPER), help="sizes (1000 10000 50000 100000)")
+    parser.add_argument(
+        "--samples", type=whole(), nargs="+", default=list(PAPER), help="sizes (1000 10000 50000 100000)"
+    )
     parser.add_argument("--presets", nargs="+", default=["paper", "default"], choices=("paper", "default"))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="of training (0 1 2)")
+    parser.add_argument("--seeds", type=whole(0), nargs="+", default=[0, 1, 2], help="of training (0 1 2)")
     parser.add_argument("--world", default="pillar(2,2,10)", help="for training and walks (pillar(2,2,10))")
     parser.add_argument("--robot", default="point", help="whose radius (point: 0.1 m)")
-    parser.add_argument("--episodes", type=int, default=1000, help="walks (1000)")
-    parser.add_argument("--threads", type=int, default=2, help="of training (2)")
+    parser.add_argument("--episodes", type=whole(), default=1000, help="walks (1000)")
+    parser.add_argument("--threads", type=whole(), default=2, help="of training (2)")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
     parser.add_argument("--only-print", action="store_true", help="train nothing")
     arguments = parser.parse_args()
@@ -147,6 +151,4 @@ def _write(file: Path, results: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("planner_table", main))

@@ -16,6 +16,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bad_input import exit_code, whole
+
 from hiernav.evaluate import evaluate_plans, open_policies
 from hiernav.reproduce.experiments import WORLDS
 from hiernav.reproduce.work import WALKERS
@@ -29,8 +31,8 @@ def main() -> int:
     source.add_argument("--bundle", default="deploy/bundles/point", help="(deploy/bundles/point)")
     source.add_argument("--run", help="a run folder instead")
     parser.add_argument("--world", action="append", metavar="WORLD", help="repeat for several (the six of the paper)")
-    parser.add_argument("--episodes", type=int, default=1000, help="per world (1000)")
-    parser.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
+    parser.add_argument("--episodes", type=whole(), default=1000, help="per world (1000)")
+    parser.add_argument("--seed", type=whole(0), default=0, help="decides the worlds (0)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
     worlds = [(world, parse_world(world)) for world in arguments.world or WORLDS]
@@ -60,6 +62,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("planner_walks", main))

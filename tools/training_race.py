@@ -27,6 +27,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bad_input import exit_code, positive, whole
+
 from hiernav.config import load_config
 
 CONTENDERS = {"hiernav": "#2b6cb0", "float32": "#2f855a", "torchrl": "#dd6b20"}
@@ -37,8 +39,10 @@ EPISODES = 200
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=Path("configs/point.yaml"), help="(configs/point.yaml)")
-    parser.add_argument("--reach", type=float, default=0.97, help="rate at which a training is there, and ends (0.97)")
-    parser.add_argument("--every", type=int, default=10_000, metavar="STEPS", help="between evaluations (10,000)")
+    parser.add_argument(
+        "--reach", type=positive, default=0.97, help="rate at which a training is there, and ends (0.97)"
+    )
+    parser.add_argument("--every", type=whole(), default=10_000, metavar="STEPS", help="between evaluations (10,000)")
     parser.add_argument("--only", nargs="+", choices=CONTENDERS, default=list(CONTENDERS), help="some of them")
     parser.add_argument("--png", type=Path, metavar="FILE", help="write a plot")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
@@ -196,6 +200,4 @@ def _plot(races: dict[str, list[dict[str, Any]]], reach: float, path: Path) -> N
 
 
 if __name__ == "__main__":
-    from bad_input import exit_code
-
     sys.exit(exit_code("training_race", main))
