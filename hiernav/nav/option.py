@@ -188,7 +188,7 @@ class WaypointOption:
     """Control steps after which a plan is outdated if it was made on another map than the present one: obstacles that
     move are avoided before they are in the way. None: never."""
     predict: bool = True
-    """Whether plans are made and swept on maps as they will be (`MapPredictor`), if the time of each step is told."""
+    """Whether plans are made and swept on maps as they will be (`MapPredictor`), if their stamps are told."""
     max_reach: float = 10.0
     """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
@@ -260,7 +260,7 @@ class WaypointOption:
         goal: np.ndarray,
         occupancy: Sequence[OccupancyMap],
         rows: np.ndarray | None = None,
-        time_: np.ndarray | None = None,
+        stamps: np.ndarray | None = None,
     ) -> OptionStep:
         """One control step: end the options that are due and plan anew for them.
 
@@ -269,7 +269,7 @@ class WaypointOption:
             goal: (M, 2) world frame [m].
             occupancy: M maps as they are now.
             rows: (M,) the rows these belong to; all N by default.
-            time_: (M,) [s], on any clock; without it no map is predicted.
+            stamps: (M,) when the maps were made, on any clock [s]; without them no map is predicted.
 
         Returns:
             The step of those M rows.
@@ -278,8 +278,8 @@ class WaypointOption:
         pick: slice | np.ndarray = slice(None) if rows is None else np.asarray(rows)
         rows = self._all_rows[pick]
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-        if self.predict and time_ is not None:
-            at_rows = zip(rows.tolist(), occupancy, time_.tolist(), position, strict=True)
+        if self.predict and stamps is not None:
+            at_rows = zip(rows.tolist(), occupancy, stamps.tolist(), position, strict=True)
             occupancy = [self._predictors[row](now, moment, where) for row, now, moment, where in at_rows]
         for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
@@ -464,7 +464,7 @@ class HierarchicalAgent:
         terms: Mapping[str, np.ndarray],
         goal: np.ndarray,
         occupancy: Sequence[OccupancyMap],
-        time_: np.ndarray | None = None,
+        stamps: np.ndarray | None = None,
     ) -> AgentStep:
         """One control step.
 
@@ -473,10 +473,10 @@ class HierarchicalAgent:
             terms: the robot's sensors by name, (N, d) each; waypoints and goal are added here.
             goal: (N, 2) world frame [m].
             occupancy: N maps as they are now.
-            time_: (N,) of the maps, on any clock [s]; that of the steps by default.
+            stamps: (N,) when the maps were made, on any clock [s]; the time of the steps by default.
         """
         since = self._steps * self.control_period
-        step = self.option.step(pose[:, :2], goal, occupancy, time_=since if time_ is None else time_)
+        step = self.option.step(pose[:, :2], goal, occupancy, stamps=since if stamps is None else stamps)
         plan = self.recovery(pose, step.plan, occupancy)
         self.option.waiting |= self.recovery.ended
         guides = guided(self.recovery.dim(terms), pose, plan, goal, since if self._clocked else None)

@@ -215,7 +215,7 @@ def test_an_option_plans_on_the_map_ahead(predict: bool) -> None:
         now = drawn(*straight(step * PERIOD))
         if step == 15:
             option.waiting[0] = True
-        option.step(HERE[None], np.array([[0.0, -2.5]]), [now], time_=np.array([step * PERIOD]))
+        option.step(HERE[None], np.array([[0.0, -2.5]]), [now], stamps=np.array([step * PERIOD]))
     assert (planner.maps[-1] is now) is not predict
     assert planner.maps[-1].occupied_at(straight(1.5 + AHEAD_S * predict)[0])
 
@@ -227,10 +227,10 @@ def test_rows_have_times_of_their_own_and_without_time_nothing_is_predicted() ->
         now = drawn(*straight(step * PERIOD))
         option.waiting[:] = step == 15
         # the second one's clock runs so fast that what moves is slower than what counts as moving
-        option.step(np.zeros((2, 2)), goal, [now, now], time_=np.array([PERIOD, 10.0]) * step)
+        option.step(np.zeros((2, 2)), goal, [now, now], stamps=np.array([PERIOD, 10.0]) * step)
     assert planner.maps[-2] is not now and planner.maps[-1] is now
     option.reset()
-    option.step(np.zeros((2, 2)), goal, [now, now], time_=np.array([1.6, 160.0]))
+    option.step(np.zeros((2, 2)), goal, [now, now], stamps=np.array([1.6, 160.0]))
     assert planner.maps[-2:] == [now, now]
     timeless = WaypointOption(planner, 1)
     for step in range(16):
