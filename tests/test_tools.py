@@ -46,6 +46,10 @@ def test_bad_input_is_one_line(command, line):
         (["planner_scale.py", "--worlds", "0"], "planner_scale.py: error: argument --worlds: 0, it must be at least 1"),
         (["planner_table.py", "--seeds", "-1"], "planner_table.py: error: argument --seeds: -1, it must be at least 0"),
         (["noise_table.py", "--workers", "0"], "noise_table.py: error: argument --workers: 0, it must be at least 1"),
+        (
+            ["training_race.py", "--reach", "7"],
+            "training_race.py: error: argument --reach: 7, it must be above 0 and at most 1",
+        ),
         (["training_race.py", "--every", "x"], "training_race.py: error: argument --every: invalid number value: 'x'"),
     ],
 )

@@ -31,6 +31,14 @@ def whole(least: int = 1) -> Callable[[str], int]:
     return number
 
 
+def share(text: str) -> float:
+    """Type of an option that takes numbers above 0, up to 1."""
+    value = float(text)
+    if not 0.0 < value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text}, it must be above 0 and at most 1")
+    return value
+
+
 def positive(text: str) -> float:
     """Type of an option that takes finite numbers above 0."""
     value = float(text)

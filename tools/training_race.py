@@ -27,7 +27,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from bad_input import exit_code, positive, whole
+from bad_input import exit_code, share, whole
 
 from hiernav.config import load_config
 
@@ -39,9 +39,7 @@ EPISODES = 200
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=Path, default=Path("configs/point.yaml"), help="(configs/point.yaml)")
-    parser.add_argument(
-        "--reach", type=positive, default=0.97, help="rate at which a training is there, and ends (0.97)"
-    )
+    parser.add_argument("--reach", type=share, default=0.97, help="rate at which a training is there, and ends (0.97)")
     parser.add_argument("--every", type=whole(), default=10_000, metavar="STEPS", help="between evaluations (10,000)")
     parser.add_argument("--only", nargs="+", choices=CONTENDERS, default=list(CONTENDERS), help="some of them")
     parser.add_argument("--png", type=Path, metavar="FILE", help="write a plot")

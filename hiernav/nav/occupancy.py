@@ -56,6 +56,14 @@ class OccupancyMap:
         """
         return self._padded_clearance[1:-1, 1:-1]
 
+    def shows_the_same_as(self, other: OccupancyMap) -> bool:
+        """Whether another map has the same pixels in the same places."""
+        return (
+            self.resolution == other.resolution
+            and self.origin == other.origin
+            and np.array_equal(self.occupied, other.occupied)
+        )
+
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Points (..., 2) [m] inside the map's extent, edges included -> (...) bool; NaN is outside."""
         points = np.asarray(points, dtype=np.float64)

@@ -208,7 +208,7 @@ class WaypointOption:
         self._planned_on: list[OccupancyMap | None] = [None] * self.num_rows
         self._changed = np.zeros(self.num_rows, dtype=bool)  # whether the map is another one than that
         self._refresh = np.iinfo(np.int64).max if self.refresh is None else self.refresh
-        self._predictors = [MapPredictor() for _ in range(self.num_rows)]
+        self._predictors = [MapPredictor(self.sweep_radius) for _ in range(self.num_rows)]
         self._swept: list[OccupancyMap | None] = [None] * self.num_rows  # the map each plan was swept against
         self._hit = np.zeros(self.num_rows)  # where it meets it last, counted in vertices of the line; 0 if nowhere
 
@@ -280,7 +280,7 @@ class WaypointOption:
         position, goal = np.asarray(position, dtype=np.float64), np.asarray(goal, dtype=np.float64)
         if self.predict and stamps is not None:
             at_rows = zip(rows.tolist(), occupancy, stamps.tolist(), position, strict=True)
-            occupancy = [self._predictors[row](now, moment, where) for row, now, moment, where in at_rows]
+            occupancy = [self._predictors[row](now, stamp, where) for row, now, stamp, where in at_rows]
         for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
             if visits is None:

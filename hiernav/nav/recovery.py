@@ -87,6 +87,7 @@ class Recovery:
         """Start new episodes in some rows (all by default)."""
         rows = slice(None) if rows is None else rows
         self._trail[rows], self._place[rows] = np.nan, np.nan
+        self._mapped[rows] = -self._window
         self._tick[rows] = self._ways_left[rows] = self._tries[rows] = self.counts[rows] = 0
         self._asked[rows] = self.active[rows] = self.ended[rows] = self.given_up[rows] = False
 

@@ -117,7 +117,7 @@ class Driver:
         Args:
             robot: what is driven.
             pilot: planner and skill.
-            occupancy: the known map at a stamp of the robot's clock [s]; the same object while nothing has moved.
+            occupancy: the known map at a stamp of the robot's clock [s].
             clock: paces the loop.
             estimator, guard, config, timer: defaults if None.
             observers: told of every tick and event; one that raises is dropped.
@@ -331,7 +331,7 @@ class Driver:
         if trust is Trust.LOST and self._trip is not None:
             self._fail(doubt, now)
         if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
-            seen.occupancy = occupancy = self._occupancy = self.occupancy(stamp)
+            seen.occupancy = occupancy = self._occupancy = self._map_at(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
                 lacks = self.pilot.lacks(terms)
@@ -353,6 +353,13 @@ class Driver:
             self._check_stop(estimate, now)
         timer.end()
         self._show(now)
+
+    def _map_at(self, stamp: float) -> OccupancyMap:
+        """The known map; where one is published again unchanged, the one that is known already."""
+        occupancy, before = self.occupancy(stamp), self._occupancy
+        if before is None or before is occupancy or not occupancy.shows_the_same_as(before):
+            return occupancy
+        return before
 
     def _take_requests(self, now: float) -> None:
         self.audience.tell(lambda observer: observer.make_requests())

@@ -44,6 +44,14 @@ def test_where_the_map_changes_a_robot_may_wait_longer(changes: int, begins: int
     assert helped.index(True) == begins
 
 
+def test_after_a_reset_a_map_is_as_new_as_any() -> None:
+    recovery, poses, last = Recovery(1, PERIOD), np.zeros((1, 3)), empty_map((3.0, 3.0))
+    for step in range(300):
+        recovery(poses + 0.1 * step, AHEAD + 0.1 * step, [empty_map((3.0, 3.0)) if step < 299 else last])
+    recovery.reset()
+    assert [recovery(poses, AHEAD, [last]) is not AHEAD for _ in range(20)].index(True) == WINDOW
+
+
 def test_the_way_on_which_it_moves_is_followed_for_as_long_again_and_is_the_last() -> None:
     recovery, ways = Recovery(1, PERIOD), []
     for t in range(WINDOW + DURATION):

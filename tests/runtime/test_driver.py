@@ -12,6 +12,7 @@ import pytest
 from puck import GOAL, PERIOD, Listener, Puck, Scripted, driver_of
 from rich.console import Console
 
+from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
@@ -516,3 +517,19 @@ def test_a_simulated_point_robot_drives_to_its_goal_on_noisy_sensors():
     truth = robot.truth()
     assert np.linalg.norm(truth.pose[:2] - layout.goal) < 0.5
     assert np.linalg.norm(truth.velocity) < 0.15
+
+
+def test_a_map_that_is_published_again_unchanged_is_no_other_map():
+    listener, pillar = Listener(), np.array([[1.5, 1.5]])
+
+    def published(stamp: float) -> OccupancyMap:
+        again = empty_map((2.0, 2.0))
+        if stamp > 0.55:
+            draw_discs(again.occupied, again.origin, again.resolution, pillar, 0.2)
+        return again
+
+    result = driver_of(occupancy=published, observers=(listener,)).run(GOAL)
+    assert result.reached
+    maps = [tick.occupancy for tick in listener.records if tick.occupancy is not None]
+    assert len({id(each) for each in maps}) == 2 < len(maps)
+    assert [bool(each.occupied.any()) for each in maps] == sorted(bool(each.occupied.any()) for each in maps)
