@@ -292,9 +292,11 @@ class Episodes:
         limits = [limit for limit in (settings.guard.slew_limit, bundle.manifest.guard.slew_limit) if limit is not None]
         guard = replace(settings.guard, slew_limit=min(limits, default=None))
         driver = settings.driver
+        agent = make_agent(bundle, driver.robot_radius, driver.goal_radius, link)
+        agent.option.predict = driver.predict
         self.driver = Driver(
             rehearsal or robot,
-            Pilot(make_agent(bundle, driver.robot_radius, driver.goal_radius, link), link),
+            Pilot(agent, link),
             lambda stamp: self.layout.occupancy(stamp),
             clock,
             Estimator(settings.estimator),
@@ -511,6 +513,7 @@ def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle
         planner_process=driver.pilot.link is not None,
         estimator=driver.estimator.config,
         guard=driver.guard.config,
+        predict=driver.config.predict,
         world=f"{arguments.world}, seed {arguments.seed}, {arguments.episodes} episodes",
     )
     return Recorder(arguments.record, about.metadata())

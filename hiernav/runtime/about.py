@@ -35,6 +35,8 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     """Whether plans were made in a process of their own and came later than asked for."""
     estimator: EstimatorConfig
     guard: GuardConfig
+    predict: bool = False
+    """Whether plans were made on maps as they would be; recordings that do not say so are from before that."""
     world: str = ""
     started: str = msgspec.field(default_factory=lambda: time.strftime("%Y-%m-%dT%H:%M:%S%z"))
     versions: dict[str, str] = msgspec.field(default_factory=lambda: _versions())

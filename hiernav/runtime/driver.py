@@ -70,10 +70,12 @@ class DriverConfig:
     """A robot slower than this, three readings in a row, has stopped [m/s]."""
     stop_timeout: float = 3.0
     """Time the robot is given to stop [s]."""
+    predict: bool = True
+    """Whether plans are made on maps as they will be where obstacles move (`hiernav.nav.prediction`)."""
 
     def __post_init__(self) -> None:
         for name, value in self.__dict__.items():
-            if not (math.isfinite(value) and value > 0):
+            if name != "predict" and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"DriverConfig.{name} = {value} must be finite and positive")
         if not self.plan_slow < self.plan_hold:
             raise ValueError(f"DriverConfig.plan_slow = {self.plan_slow} must be less than plan_hold")

@@ -58,6 +58,7 @@ def about() -> About:
         planner_process=False,
         estimator=ESTIMATOR,
         guard=GuardConfig(),
+        predict=True,
     )
 
 

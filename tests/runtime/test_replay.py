@@ -59,6 +59,16 @@ def test_everything_that_was_decided_is_decided_again_bit_for_bit(tmp_path, bund
     assert result.compared["sent"] > 150
 
 
+def test_a_recording_says_whether_maps_were_predicted(tmp_path, bundle):
+    """One that does not say so is from before that; where it matters the plans then differ."""
+    log = recorded(tmp_path / "run.mcap", {"seed": 2, "world": "gremlin"})
+    assert log.about["predict"] == "true"
+    assert Replay(log, bundle).compare().equal
+    log.about.pop("predict")
+    result = Replay(log, bundle).compare()
+    assert result.difference is not None and result.difference.tick > 15
+
+
 def test_waiting_and_recovering_are_replayed_too(tmp_path, bundle):
     def blink(frame):
         return SensorFrame(frame.stamp, lidar=frame.lidar) if 0.5 < frame.stamp < 0.9 else frame
