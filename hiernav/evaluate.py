@@ -131,7 +131,7 @@ def evaluate(
         radius = get_robot(policies.config.robot).radius
         layouts = [sample_layout(world, int(s), radius) for s in episode_seeds(seed, count)]
         task = make_task(policies.config, min(rows, count), plan, [world])
-        task.option.predict = predict and not policies.is_baseline
+        task.option.predict &= predict
         began = time.perf_counter()
         report = None if on_episode is None else partial(on_episode, name)
         done = run_episodes(task, policies.skill, layouts, report, recover=recover)

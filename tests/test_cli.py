@@ -319,7 +319,7 @@ def test_a_run_and_its_bundle_are_evaluated(able_run, able_bundle, tmp_path, cap
     assert cli.main(["evaluate", "--run", str(able_run), *world, "--json", "-"]) == 0
     from_run = json.loads(capsys.readouterr().out)
     file = tmp_path / "deep" / "results.json"
-    two = [*world, "--world", "two-room(1.5,1.5)", "--protocol", "paper", "--robot", "point"]
+    two = [*world, "--world", "two-room(1.5,1.5)", "--protocol", "paper", "--robot", "point", "--no-prediction"]
     assert cli.main(["evaluate", "--bundle", str(able_bundle), *two, "--json", str(file)]) == 0
     assert tiny_run.WORLD in capsys.readouterr().out.replace("\n", "")
     from_bundle = json.loads(file.read_text())
@@ -327,6 +327,7 @@ def test_a_run_and_its_bundle_are_evaluated(able_run, able_bundle, tmp_path, cap
     ours, theirs = from_run[tiny_run.WORLD], from_bundle[tiny_run.WORLD]
     assert (ours["reach_rate"], ours["steps_mean"]) == (theirs["reach_rate"], theirs["steps_mean"])
     assert (ours["protocol"], theirs["protocol"]) == ("strict", "paper")
+    assert (ours["predict"], theirs["predict"]) == (True, False)
     assert ours["reach_ci95"] == list(wilson_interval(round(5 * ours["reach_rate"]), 5))
     wanted = {
         "reach_rate", "reach_ci95", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean", "episodes",

@@ -127,9 +127,10 @@ def test_a_row_says_what_helped(guidance: str, planner: str, recover: bool):
     policies = policies_of(
         config=load_config(None, settings), skill=lambda observation: np.zeros((len(observation), 2))
     )
-    row = evaluate(policies, [WORLD], planner="astar", episodes=1, recover=recover)[tiny_run.WORLD]
+    row = evaluate(policies, [WORLD], planner="astar", episodes=1, recover=recover, predict=not recover)[tiny_run.WORLD]
     assert (row["planner"], row["repair"], row["period"], row["invalid"]) == (planner, False, 9, False)
     assert row["recover"] is (recover and guidance == "default")
+    assert row["predict"] is (not recover and guidance == "default")
     for repair in (True, False):
         walked = evaluate_plans(policies, WORLD, "astar", repair, episodes=2)
         assert (walked["planner"], walked["repair"]) == (planner, False)

@@ -84,6 +84,7 @@ def make_task(
         goal_radius=GOAL_RADIUS,
         sweep_radius=robot.radius,
         refresh=refresh_steps(robot.control_period),
+        predict=config.skill.preset != "baseline",  # which does not follow its plans
     )
     return NavigationTask(
         robot,
