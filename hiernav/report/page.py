@@ -25,8 +25,8 @@ _RECOVERY = (
     "this helps only a skill that follows waypoints, so the baseline never gets it."
 )
 _PREDICTION = (
-    "In gremlin, our plans are made on the map as it will be 0.9 s later; in the paper, and when our skills learned, on "
-    "the map as it is (what it is worth is among the ablations: <i>plans are made on maps as they are</i>)."
+    "In gremlin, our plans are made on the map as it will be 0.9 s later; in the paper, and when our skills learned, "
+    "on the map as it is (what it is worth is among the ablations: <i>plans are made on maps as they are</i>)."
 )
 _TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
 
