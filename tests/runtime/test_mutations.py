@@ -28,7 +28,7 @@ class Mutant:
 
 
 R, F, T = "hiernav/runtime", "tests/runtime/faults", "tests/runtime"
-WATCH = f"{R}/watchdogs.py"
+WATCH, PREDICTION, P = f"{R}/watchdogs.py", "hiernav/nav/prediction.py", "tests/nav/test_prediction.py"
 MUTANTS = (
     Mutant("lost sensors", WATCH, "if age > self.lost_after:", "if False:", f"{F}/test_01_waiting_for_sensors.py"),
     Mutant("silent sensors", WATCH, "if age > self.hold_after:", "if False:", f"{F}/test_01_waiting_for_sensors.py"),
@@ -126,6 +126,14 @@ MUTANTS = (
     Mutant("stop in a flood from the page", "hiernav/view/commands.py", 'if command.kind == "estop":', "if False:",
            "tests/view/test_link.py"),
     Mutant("limit of requests", f"{R}/driver.py", "deque(maxlen=REQUESTS)", "deque()", f"{F}/test_29_viewer_stalls.py"),
+    Mutant("head-on obstacle", PREDICTION, "occupied[row, col] = stays[label]", "occupied[row, col] = False", P),
+    Mutant("wall in sight", PREDICTION, "* occupancy.resolution <= LARGEST_M", "<= np.inf", P),
+    Mutant("obstacle that grows", PREDICTION, "moves &= self._drifts[watched] <= _DRIFT * np.abs(way)", "pass", P),
+    Mutant("obstacle that stops", PREDICTION, "<= _ASTRAY * np.abs(should))", "<= np.inf)", P),
+    Mutant("map that stands", PREDICTION, "elif len(self._times) and not 0.0 <= gap <= GAP_S:", "elif False:", P),
+    Mutant("map after a gap", PREDICTION, "not (0.0 < gap <= GAP_S and", "not (True and", P),
+    Mutant("same map again", f"{R}/driver.py", "or not occupancy.shows_the_same_as(before):", "or True:",
+           f"{T}/test_driver.py"),
 )  # fmt: skip
 
 
