@@ -292,11 +292,9 @@ class Episodes:
         limits = [limit for limit in (settings.guard.slew_limit, bundle.manifest.guard.slew_limit) if limit is not None]
         guard = replace(settings.guard, slew_limit=min(limits, default=None))
         driver = settings.driver
-        agent = make_agent(bundle, driver.robot_radius, driver.goal_radius, link)
-        agent.option.predict = driver.predict
         self.driver = Driver(
             rehearsal or robot,
-            Pilot(agent, link),
+            Pilot(make_agent(bundle, driver.robot_radius, driver.goal_radius, link, driver.predict), link),
             lambda stamp: self.layout.occupancy(stamp),
             clock,
             Estimator(settings.estimator),

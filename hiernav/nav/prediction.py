@@ -49,7 +49,7 @@ _ACCELERATION = 0.5
 class MapPredictor:
     """Predicts the map of one robot; obstacles keep their speed and their rate of turn.
 
-    An obstacle is a connected set of occupied pixels. It is known again by its place and its size, and is taken to
+    An obstacle is a connected set of occupied pixels. It is known again by its place and its shape, and is taken to
     stand until it has been seen to move for a while. What moves is shifted by whole pixels; if it is on its way to the
     robot it is drawn at both ends, so that no plan leads through it. All else is left as it is, and a map on which
     nothing moves is its own prediction. What stops is shown where it stands again within 0.3 s, or after `GAP_S` if the

@@ -174,7 +174,11 @@ def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: floa
 
 
 def make_agent(
-    bundle: Bundle, robot_radius: float, goal_radius: float = 0.3, planner: DeferredPlanner | None = None
+    bundle: Bundle,
+    robot_radius: float,
+    goal_radius: float = 0.3,
+    planner: DeferredPlanner | None = None,
+    predict: bool = True,
 ) -> HierarchicalAgent:
     """The agent a bundle describes, for one robot: planner with verification, termination rule, skill.
 
@@ -183,6 +187,7 @@ def make_agent(
         robot_radius: disc with which plans are swept against the map [m].
         goal_radius: distance at which the goal counts as reached [m].
         planner: in the place of the bundle's own, such as one in a process of its own.
+        predict: see `WaypointOption`.
 
     Raises:
         BundleError: as `load_policies`.
@@ -196,6 +201,7 @@ def make_agent(
         goal_radius=goal_radius,
         sweep_radius=robot_radius,
         refresh=refresh_steps(bundle.manifest.control_period_s),
+        predict=predict,
     )
     return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s)
 

@@ -91,8 +91,7 @@ class Replay:
         network = load_policies(bundle).planner
         self._planner = make_planner(bundle, network, about.robot_radius, about.goal_radius)
         self._asked = _Asked() if about.planner_process else None
-        self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked)
-        self._agent.option.predict = about.predict
+        self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked, about.predict)
         self._agent.recovery = self._recovery = _Recorded(1, self._agent.control_period)
         self._estimator = Estimator(about.estimator)
         self._guard = Guard(bundle.golden["action"].shape[1], about.guard)

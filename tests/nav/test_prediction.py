@@ -17,7 +17,7 @@ RADIUS = 0.15
 
 
 def drawn(*centers: tuple[float, float] | np.ndarray, half: float = 3.0) -> OccupancyMap:
-    """Discs, between two walls that stand."""
+    """Discs, and a wall that stands."""
     field = empty_map((half, half))
     draw_boxes(field.occupied, field.origin, field.resolution, np.array([[0.0, 1.5]]), np.array([[1.0, 0.05]]))
     draw_discs(field.occupied, field.origin, field.resolution, np.array(centers).reshape(-1, 2), RADIUS)
