@@ -26,7 +26,7 @@ class Recovery:
     """Gives robots that should move and do not a way out.
 
     A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away; where
-    the map has changed meanwhile, within `patience_s`: it may wait for what is in its way to move on. It is then shown
+    the map has changed meanwhile, within `patience_s` too: it may wait for what is in its way to move on. It is then shown
     one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as long
     again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each without
     coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
@@ -61,6 +61,7 @@ class Recovery:
         self._try = max(1, round(try_s / control_period))
         self._window = max(1, round(window_s / control_period))
         self._trail = np.full((num_rows, max(self._window, round(patience_s / control_period)), 2), np.nan)
+        self._all_rows = np.arange(num_rows)
         self._tick = np.zeros(num_rows, dtype=np.int64)
         self._map: list[OccupancyMap | None] = [None] * num_rows
         self._mapped = np.zeros(num_rows, dtype=np.int64)  # the tick of the newest map
@@ -117,15 +118,17 @@ class Recovery:
         Returns:
             (M, K, 2) world frame [m]; `plan` itself where no robot is on its way out.
         """
-        rows = np.arange(len(self.counts)) if rows is None else rows
+        rows = self._all_rows if rows is None else rows
         position, tick, length = pose[:, :2], self._tick[rows], self._trail.shape[1]
-        for row, at_tick, now in zip(rows.tolist(), tick.tolist(), occupancy, strict=True):
+        for row, now in zip(rows.tolist(), occupancy, strict=True):
             if self._map[row] is not now:
-                self._map[row], self._mapped[row] = now, at_tick
-        patient = self._mapped[rows] > tick - self._window
-        since = np.where(patient, tick, tick - self._window) % length  # the slot that is written next is the oldest
+                self._map[row], self._mapped[row] = now, self._tick[row]
         # comparisons with NaN, where the window is not full or a position unknown, are False
-        still = distances(position, self._trail[rows, since]) < self.least_m
+        still = distances(position, self._trail[rows, (tick - self._window) % length]) < self.least_m
+        if np.count_nonzero(still):
+            patient = self._mapped[rows] > tick - self._window
+            oldest = self._trail[rows, tick % length]  # the slot that is written next
+            still &= ~patient | (distances(position, oldest) < self.least_m)
         self._trail[rows, tick % length] = position
         self._tick[rows] += 1
         if self._quiet and not np.count_nonzero(still):
