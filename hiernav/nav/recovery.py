@@ -26,8 +26,8 @@ class Recovery:
     """Gives robots that should move and do not a way out.
 
     A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away; where
-    the map has changed meanwhile, within `patience_s` too: it may wait for what is in its way to move on. It is then shown
-    one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as long
+    the map has changed meanwhile, within `patience_s` too: it may wait for what is in its way to move on. It is then
+    shown one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as long
     again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each without
     coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
 

@@ -247,28 +247,21 @@ class _Maker:
         return cells + driven
 
     def ablated(self) -> list[Cell]:
-        """Trainings that differ from ours in one respect, and those of fixed periods."""
-        cells = []
-        ours = self._config(0, [])
+        """Trainings that differ from ours in one respect, and those of fixed periods; every one of them before the next
+        seed of any."""
+        variants: list[tuple[str, str, list[str]]] = []
         for name, overrides in TRAINING.items():
-            if self.robot != (TABLE3_ROBOT if name in OF_LEGS else ABLATED) or self._config(0, overrides) == ours:
-                continue
-            for seed in range(self.given_seeds or ABLATION_SEEDS):
-                cells.append(
-                    self._train("ablations", name, seed, overrides, (f"sample_efficiency/{self.robot}-ours-{seed}",))
-                )
+            if self.robot == (TABLE3_ROBOT if name in OF_LEGS else ABLATED):
+                variants.append(("ablations", name, overrides))
         for period in PERIODS if self.robot == ABLATED else ():
-            for seed in range(self.given_seeds or ABLATION_SEEDS):
-                cells.append(
-                    self._train(
-                        "replanning",
-                        f"trained-period-{period}",
-                        seed,
-                        [f"option.period={period}"],
-                        (f"sample_efficiency/{self.robot}-ours-{seed}",),
-                    )  # fmt: skip
-                )
-        return cells
+            variants.append(("replanning", f"trained-period-{period}", [f"option.period={period}"]))
+        ours = self._config(0, [])
+        variants = [each for each in variants if self._config(0, each[2]) != ours]
+        return [
+            self._train(experiment, name, seed, overrides, (f"sample_efficiency/{self.robot}-ours-{seed}",))
+            for seed in range(self.given_seeds or ABLATION_SEEDS)
+            for experiment, name, overrides in variants
+        ]
 
     def _config(self, seed: int, overrides: list[str]) -> str:
         file = self.root / "configs" / f"{self.robot}.yaml"
