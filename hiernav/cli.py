@@ -296,6 +296,7 @@ def _train(arguments: argparse.Namespace) -> int:
         config = fine_tuning_config(arguments.source, overrides)
         _check_worlds(config)
         _check_machine(config)
+        _check_data(config)
         run = begin_fine_tuning(config, arguments.source)
     elif arguments.resume:
         if arguments.config or overrides:
@@ -308,6 +309,7 @@ def _train(arguments: argparse.Namespace) -> int:
         config = load_config(arguments.config, overrides)
         _check_worlds(config)
         _check_machine(config)
+        _check_data(config)
         run = Run.create(config)
     from hiernav.training import train
 
@@ -538,18 +540,19 @@ def _dataset(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> int:
+    from hiernav.report.figures import PICTURES, save_training
     from hiernav.report.page import write_report
 
     for option, file in (("--out", arguments.out), ("--curves", arguments.curves)):
         if file is not None and file.is_dir():
             raise ValueError(f"{option} {file} is a folder: name a file in it")
+    if arguments.curves and arguments.curves.suffix not in PICTURES:
+        raise ValueError(f"--curves {arguments.curves} must end in {', '.join(PICTURES)}")
     book = write_report(arguments.results, arguments.out)
     failed = sum(result.state == "failed" for result in book.results)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {size:.2f} MB; {len(book.results)} results, {failed} of them failed cells")
     if arguments.curves:
-        from hiernav.report.figures import save_training
-
         save_training(book, arguments.curves)
         print(f"wrote {arguments.curves}")
     for line in book.damaged:
@@ -635,6 +638,14 @@ def _check_machine(config: TrainConfig) -> None:
     choose_device(config.skill.device, "skill.device")
     if config.skill.collector == "ray":
         import ray  # noqa: F401
+
+
+def _check_data(config: TrainConfig) -> None:
+    """Refuse a data set that is not there or that this run cannot learn from, before a run folder is made."""
+    if config.planner.data is not None:
+        from hiernav.planner.train import settings_of_data
+
+        settings_of_data(config)
 
 
 def _print_results(results: dict[str, dict[str, Any]]) -> None:

@@ -447,6 +447,18 @@ def test_a_folder_in_the_place_of_a_file_of_the_report_is_refused(refused, tmp_p
     assert f"{option} {folder} is a folder: name a file in it" in refused("report", option, folder)
 
 
+def test_curves_of_a_kind_that_cannot_be_drawn_are_refused_before_the_report_is_made(refused, tmp_path):
+    out = tmp_path / "report.html"
+    assert "must end in .png, .svg, .pdf" in refused("report", "--out", str(out), "--curves", "curves.xyz")
+    assert not out.exists()
+
+
+def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
+    run = tmp_path / "run"
+    assert "data" in refused("train", "--stage", "planner", "planner.data=nowhere", f"run_dir={run}")
+    assert not run.exists()
+
+
 def start(*arguments: str) -> subprocess.Popen[str]:
     command: Sequence[str] = (sys.executable, "-m", "hiernav.cli", *arguments)
     # where the tests run in the background of a shell, Ctrl-C is ignored by all that they start

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
         (["noise_table.py", "--bundle", "/nope"], "noise_table: /nope: no such folder"),
         (["training_race.py", "--config", "/nope"], "training_race: /nope: cannot be read"),
         (["bench.py", "--tick", "--bundle", "/nope"], "bench: /nope: no such folder"),
-        (["bench_loop.py", "--rate", "50", "--seconds", "nan"], "bench_loop: --seconds is nan, it must be at least 1"),
+        (["bench_loop.py", "--bundle", "/nope", "--rate", "50"], "bench_loop: /nope: no such folder"),
     ],
 )
 def test_bad_input_is_one_line(command, line):
@@ -49,6 +49,14 @@ def test_bad_input_is_one_line(command, line):
         (
             ["training_race.py", "--reach", "7"],
             "training_race.py: error: argument --reach: 7, it must be above 0 and at most 1",
+        ),
+        (
+            ["bench_loop.py", "--seconds", "nan"],
+            "bench_loop.py: error: argument --seconds: nan, it must be finite and at least 1",
+        ),
+        (
+            ["bench_loop.py", "--rehearsal", "-1"],
+            "bench_loop.py: error: argument --rehearsal: -1, it must be finite and at least 0",
         ),
         (["training_race.py", "--every", "x"], "training_race.py: error: argument --every: invalid number value: 'x'"),
     ],

@@ -31,6 +31,18 @@ def whole(least: int = 1) -> Callable[[str], int]:
     return number
 
 
+def number_from(least: float) -> Callable[[str], float]:
+    """Type of an option that takes finite numbers, none below `least`."""
+
+    def number(text: str) -> float:
+        value = float(text)
+        if not least <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text}, it must be finite and at least {least:g}")
+        return value
+
+    return number
+
+
 def share(text: str) -> float:
     """Type of an option that takes numbers above 0, up to 1."""
     value = float(text)

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
-from bad_input import exit_code, whole  # noqa: E402
+from bad_input import exit_code, number_from, whole  # noqa: E402
 
 WORLD = "pillar(4,4,40)"
 RUNS = ((50, 60.0, 0), (100, 60.0, 0), (50, 60.0, 2), (500, 10.0, 0))
@@ -33,15 +33,15 @@ RUNS = ((50, 60.0, 0), (100, 60.0, 0), (50, 60.0, 2), (500, 10.0, 0))
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rate", type=int, choices=(50, 100, 500), help="only one run, at so many ticks a second")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of that run (60)")
+    parser.add_argument("--seconds", type=number_from(1.0), default=60.0, help="of that run (60)")
     parser.add_argument("--hogs", type=whole(0), default=0, help="processes that compute beside that run (0)")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="of the point robot")
-    parser.add_argument("--rehearsal", type=float, default=0.0025, help="before each tick [s]; 0 for none (0.0025)")
+    parser.add_argument(
+        "--rehearsal", type=number_from(0.0), default=0.0025, help="before each tick [s]; 0 for none (0.0025)"
+    )
     parser.add_argument("--normal", action="store_true", help="ask for no real-time scheduling")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
-    if not 1.0 <= arguments.seconds < float("inf"):
-        raise ValueError(f"--seconds is {arguments.seconds:g}, it must be at least 1")
     if arguments.rate is None:
         found = bench_loop(arguments.bundle, arguments.normal)
     else:

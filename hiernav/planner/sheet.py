@@ -38,7 +38,7 @@ def draw_sheet(samples: Samples, settings: LabelSettings, path: str | Path, coun
         near.imshow(samples.clearance[sample], cmap="bone", vmin=0, vmax=255)
         _draw_plan(near, label, length, goselo.LOCAL_SIDE, 0.0)
         wide.set_title(f"L = {length:.2f} m", fontsize=6, pad=2)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, format="png")
 
 
 def _overview(image: np.ndarray, settings: LabelSettings) -> np.ndarray:

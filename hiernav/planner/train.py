@@ -73,9 +73,7 @@ class PlannerTrainer:
             planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
         ).to(self.device, memory_format=torch.channels_last)
         self.precision = choose_precision(planner.precision, self.device)
-        self.labels = label_settings(config)
-        if planner.data is not None:
-            self.labels = _settings_of(planner.data, self.labels)
+        self.labels = label_settings(config) if planner.data is None else settings_of_data(config)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=planner.learning_rate, weight_decay=planner.weight_decay
         )
@@ -311,12 +309,15 @@ def load_network(config: TrainConfig, state: dict) -> PaperNetwork | HypothesisN
     return network.eval()
 
 
-def _settings_of(folder: str, ours: LabelSettings) -> LabelSettings:
-    """Label settings of a data set.
+def settings_of_data(config: TrainConfig) -> LabelSettings:
+    """Label settings of the data set that is named in a configuration.
 
     Raises:
-        DatasetError: its labels are not those that this run's network has to learn.
+        DatasetError: there is none, or its labels are not those that this run's network has to learn.
     """
+    folder, ours = config.planner.data, label_settings(config)
+    if folder is None:
+        raise DatasetError("planner.data names no data set")
     theirs = read_manifest(folder).settings
     for name in ("radius", "soft_margin", "waypoints", "spacing", "random_smoothing", "channels"):
         if getattr(theirs, name) != getattr(ours, name):

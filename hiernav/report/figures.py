@@ -77,8 +77,12 @@ def training(book: Book, robot: str, name: str, what: str) -> str | None:
     return _svg(f"training-{robot}-{name}", draw, f"{what} during training of the {robot}")
 
 
+PICTURES = (".png", ".svg", ".pdf")
+"""What the name of a picture may end in."""
+
+
 def save_training(book: Book, out: Path) -> None:
-    """Reach rates during the trainings of all robots side by side, as a picture (PNG, SVG or PDF, by its name)."""
+    """Reach rates during the trainings of all robots side by side, as one of `PICTURES`, by its name."""
     figure = Figure(figsize=(11.0, 3.2), dpi=110, layout="constrained")
     for robot, axes in zip(ROBOTS, figure.subplots(1, len(ROBOTS), sharey=True), strict=True):
         _draw_training(axes, book, robot, "reach_rate", "reach rate" if robot == ROBOTS[0] else "")
