@@ -180,6 +180,8 @@ def _port(text: str) -> int:
 def _tell(arguments: argparse.Namespace) -> int:
     answer = tell(arguments.control or default_socket(), arguments.tell)
     print(json.dumps(answer, indent=2))
+    if "refused" in answer:
+        return BAD_GOAL
     return BAD_INPUT if "error" in answer else OK
 
 
@@ -203,9 +205,9 @@ def _dry_run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
-    """Those of the robot's file beside this one, unless another is named."""
+    """Those of the robot's file beside this one, with what a file that is named says over them."""
     own = Path(__file__).resolve().parent / f"{spec.name}.yaml"
-    path = arguments.settings or (own if own.exists() else None)
+    paths = [path for path in (own if own.exists() else None, arguments.settings) if path is not None]
     asked = {
         "estimator": {"tilts": spec.free_base},
         "driver": {
@@ -214,7 +216,7 @@ def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
             "max_steps": parse_world(arguments.world).max_steps,
         },
     }
-    settings = load_settings(path, arguments.set, asked)
+    settings = load_settings(paths, arguments.set, asked)
     return replace(settings, noise=EXACT) if arguments.exact else settings
 
 
@@ -223,10 +225,10 @@ def _process_robot(
 ) -> ProcessRobot:
     """The robot behind an adapter in its own process, which is closed with `stack`."""
     if arguments.adapter:
-        robot = ProcessRobot(arguments.adapter)
+        robot = ProcessRobot(arguments.adapter, realtime=settings.realtime)
     else:
         noise = asdict(settings.noise)
-        robot = simulated(robot=spec.name, world=arguments.world, seed=arguments.seed, noise=noise)
+        robot = simulated(settings.realtime, robot=spec.name, world=arguments.world, seed=arguments.seed, noise=noise)
     stack.callback(robot.close)
     return robot
 

@@ -457,6 +457,10 @@ def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
     run = tmp_path / "run"
     assert "data" in refused("train", "--stage", "planner", "planner.data=nowhere", f"run_dir={run}")
     assert not run.exists()
+    data = ["dataset", "--out", str(tmp_path / "data"), "--world", "pillar(1.2,1.2,2)", "planner.samples=6"]
+    assert cli.main(data) == 0
+    line = refused("train", "--stage", "planner", f"planner.data={tmp_path / 'data'}", f"run_dir={run}")
+    assert "has 6 samples, 60,000 are wanted" in line and not run.exists()
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

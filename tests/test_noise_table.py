@@ -61,7 +61,7 @@ def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatc
     monkeypatch.setattr(tool, "Driver", driver)
     with pytest.raises(Stop):
         tool.drive(tool.Case(), str(BUNDLES / robot), "gremlin", [0], told=True)
-    shipped = load_settings(ROOT / "deploy" / f"{robot}.yaml").guard
+    shipped = load_settings([ROOT / "deploy" / f"{robot}.yaml"]).guard
     bundle = load_bundle(BUNDLES / robot)
     (guard,) = (each for each in driven if isinstance(each, Guard))
     assert guard.config == replace(shipped, slew_limit=bundle.manifest.guard.slew_limit)

@@ -274,6 +274,28 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"summary.json", f"drive-{seed}.png", f"drive-{seed + 1}.png"}
 
 
+@pytest.mark.parametrize(
+    ("answer", "code"),
+    [
+        ({"mode": "running"}, 0),
+        ({"error": "unknown command"}, 2),
+        ({"mode": "ready", "refused": "goal_outside", "error": "outside"}, 4),
+    ],
+)
+def test_what_a_loop_answers_is_printed_and_decides_the_exit_code(script, monkeypatch, capsys, answer, code):
+    monkeypatch.setattr(script, "tell", lambda path, line: answer)
+    assert script.main(["--tell", "goal 50,50"]) == code
+    assert json.loads(capsys.readouterr().out) == answer
+
+
+def test_a_file_of_settings_takes_nothing_away_from_the_robot_s_own(script, tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text("estimator: {gyro_sigma: 0.05}\n")
+    arguments = script._parser().parse_args(["--robot", "doggo", "--settings", str(own)])
+    settings = script._settings(arguments, script.get_robot("doggo"))
+    assert settings.estimator.gyro_sigma == 0.05 and settings.guard.tilt_limit == 1.31
+
+
 def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path):
     file = tmp_path / "out.json"
     arguments = ["--fast", "--robot", "doggo", "--bundle", str(doggo_bundle), "--episodes", "2", "--no-pictures"]

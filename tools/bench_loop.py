@@ -91,7 +91,7 @@ def measure(
     occupancy = layout.occupancy(0.0)
     link = ProcessPlanner(bundle, 0.1, occupancy.occupied.size)
     pilot = Pilot(make_agent(bundle, 0.1, planner=link), link)
-    guard = Guard(2, load_settings(ROOT / "deploy" / "point.yaml").guard)
+    guard = Guard(2, load_settings([ROOT / "deploy" / "point.yaml"]).guard)
     estimator, config = Estimator(EstimatorConfig(tilts=False)), DriverConfig(max_steps=10**9)
     driver = Driver(
         robot, pilot, lambda stamp: occupancy, MonotonicClock(), estimator, guard, config, rehearsal=rehearsal

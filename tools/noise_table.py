@@ -159,7 +159,7 @@ def robot_settings(spec: RobotSpec) -> Settings:
         "estimator": {"tilts": spec.free_base},
         "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS},
     }
-    return load_settings(file if file.exists() else None, defaults=asked)
+    return load_settings([file] if file.exists() else [], defaults=asked)
 
 
 def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> dict[str, dict[str, Any]]:

@@ -163,10 +163,7 @@ def read_dataset(
     """
     manifest = read_manifest(folder)
     count = manifest.samples if count is None else count
-    if count > manifest.made:
-        raise DatasetError(
-            f"{folder} has {manifest.made:,} samples, {count:,} are wanted: let `hiernav dataset` go on with it"
-        )
+    require_samples(folder, manifest, count)
     samples, done = Samples.empty(manifest.settings, count), 0
     for shard in manifest.shards:
         if done == count:
@@ -175,6 +172,14 @@ def read_dataset(
         if on_progress is not None:
             on_progress(done)
     return samples
+
+
+def require_samples(folder: str | Path, manifest: Manifest, count: int) -> None:
+    """Raise DatasetError unless so many samples are there."""
+    if count > manifest.made:
+        raise DatasetError(
+            f"{folder} has {manifest.made:,} samples, {count:,} are wanted: let `hiernav dataset` go on with it"
+        )
 
 
 def _compatible(folder: Path, there: Manifest, wanted: Manifest) -> Manifest:

@@ -31,7 +31,7 @@ from hiernav.planner.network import (
     TorchNetwork,
     make_network,
 )
-from hiernav.planner.store import DatasetError, read_dataset, read_manifest
+from hiernav.planner.store import DatasetError, read_dataset, read_manifest, require_samples
 from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
@@ -313,18 +313,21 @@ def settings_of_data(config: TrainConfig) -> LabelSettings:
     """Label settings of the data set that is named in a configuration.
 
     Raises:
-        DatasetError: there is none, or its labels are not those that this run's network has to learn.
+        DatasetError: there is none, it has too few samples, or its labels are not those that this run's network has to
+            learn.
     """
     folder, ours = config.planner.data, label_settings(config)
     if folder is None:
         raise DatasetError("planner.data names no data set")
-    theirs = read_manifest(folder).settings
+    manifest = read_manifest(folder)
+    theirs = manifest.settings
     for name in ("radius", "soft_margin", "waypoints", "spacing", "random_smoothing", "channels"):
         if getattr(theirs, name) != getattr(ours, name):
             raise DatasetError(
                 f"planner.data = {folder!r} was made with {name} = {getattr(theirs, name)!r}, "
                 f"this run plans with {getattr(ours, name)!r}: make another one with `hiernav dataset`"
             )
+    require_samples(folder, manifest, config.planner.samples)
     return theirs
 
 

@@ -12,17 +12,21 @@ import stat
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hiernav.runtime.driver import Driver
+from hiernav.runtime.trip import REFUSALS
 
 LONGEST = 256
 """Bytes of a command."""
 PATIENCE = 1.0
-"""Time a client may take for its line, all of it [s]."""
+"""Time a client may take for its line, all of it, and at most that of an answer from then on [s]."""
+LOOK_AGAIN = 0.005
+"""Time between looks at whether a command has taken effect [s]."""
 CLIENTS = 32
 """Clients that may be at their line at the same time; the one after them takes the place of the first."""
 COMMANDS = ("goal X,Y", "cancel", "pause", "resume", "stop", "acknowledge", "status", "quit")
@@ -52,27 +56,46 @@ def parse_point(text: str) -> np.ndarray:
     return point
 
 
-def obey(driver: Driver, command: str) -> dict[str, Any]:
+def obey(driver: Driver, command: str) -> Callable[[], dict[str, Any] | None]:
     """Do what a line says.
 
+    Returns:
+        What tells the state that this has led to, and None before it has taken effect: a loop takes its commands at the
+        beginning of a tick. Of a goal that it refused then, the answer says so (`refused`, `error`).
+
     Raises:
-        ValueError: it says nothing that is known.
+        ValueError: it says nothing that is known, or a goal is set that would not be driven to before a fault or stop
+            is acknowledged.
     """
     word, _, rest = command.strip().partition(" ")
+    before, ticks, late = driver.ended, driver.loop.ticks, time.monotonic() + PATIENCE
     if word == "goal":
-        driver.set_goal(parse_point(rest.strip()))
+        goal, supervisor = parse_point(rest.strip()), driver.supervisor
+        if supervisor.latched:
+            raise ValueError(f"{supervisor.mode.value} takes no goals until it is acknowledged: {supervisor.fault}")
+        driver.set_goal(goal)
     elif rest or word not in (known.split()[0] for known in COMMANDS):
         raise ValueError(f"unknown command {command.strip()!r}; known: {', '.join(COMMANDS)}")
     elif word == "stop":
         driver.estop("stop was commanded")
     elif word != "status":
         getattr(driver, word)()
-    return describe(driver)
+
+    def answer() -> dict[str, Any] | None:
+        # the tick that runs now may have taken its commands already, the next one is done when the one after it begins
+        if word not in ("status", "quit") and driver.loop.ticks < ticks + 2 and time.monotonic() < late:
+            return None
+        ended = driver.ended
+        if word == "goal" and ended is not before and ended is not None and ended.reason in REFUSALS:
+            return {**describe(driver), "refused": ended.reason, "error": ended.detail or ended.reason}
+        return describe(driver)
+
+    return answer
 
 
 def describe(driver: Driver) -> dict[str, Any]:
     """The state of a loop, in JSON's own types."""
-    estimate, result, goal = driver.estimate, driver.last_result, driver.goal
+    estimate, ended, goal = driver.estimate, driver.ended, driver.goal
     return {
         "mode": driver.supervisor.mode.value,
         "why": driver.supervisor.why,
@@ -80,7 +103,7 @@ def describe(driver: Driver) -> dict[str, Any]:
         "goal": None if goal is None else goal.tolist(),
         "pose": None if estimate is None else estimate.pose.tolist(),
         "speed": None if estimate is None else math.hypot(*estimate.velocity.tolist()),
-        "last": None if result is None else {"reason": result.reason, "detail": result.detail, "steps": result.steps},
+        "last": None if ended is None else {"reason": ended.reason, "detail": ended.detail, "steps": ended.steps},
         "rate": driver.timer.rate,
         "ticks": driver.loop.ticks,
         "overruns": driver.loop.overruns,
@@ -90,7 +113,8 @@ def describe(driver: Driver) -> dict[str, Any]:
 class ControlServer:
     """Listens in a thread of its own, for as long as it is entered (`with`).
 
-    A line is obeyed as soon as it is whole: no client waits for another one, however slow that is.
+    A line is obeyed as soon as it is whole: no client waits for another one, however slow that is. It is answered once
+    it has taken effect.
     """
 
     def __init__(self, driver: Driver, path: Path) -> None:
@@ -138,15 +162,19 @@ class ControlServer:
 
     def _listen(self) -> None:
         clients: list[_Client] = []  # the first to have come is the first to run out of time
+        obeyed: list[_Client] = []
         while not self._closed:
             wait = max(clients[0].deadline - time.monotonic(), 0.0) if clients else None
+            if obeyed:
+                wait = LOOK_AGAIN if wait is None else min(wait, LOOK_AGAIN)
             heard: list[socket.socket | _Client] = [self._server, *clients]
             ready = select.select(heard, [], [], wait)[0]
-            for client in [each for each in clients if each in ready]:
-                reply = client.hear(self.driver)
-                if reply is not None:
-                    client.answer(reply)
-                    clients.remove(client)
+            for client in [each for each in clients if each in ready and each.hear(self.driver)]:
+                clients.remove(client)
+                obeyed.append(client)
+            obeyed = [client for client in obeyed if not client.answered()]
+            while len(obeyed) > CLIENTS:
+                obeyed.pop(0).answer(describe(self.driver))
             while clients and clients[0].deadline <= time.monotonic():
                 clients.pop(0).answer({"error": f"expected one line within {PATIENCE:g} s"})
             if self._server in ready:
@@ -157,6 +185,8 @@ class ControlServer:
                     continue
                 if len(clients) > CLIENTS:
                     clients.pop(0).answer({"error": "too many clients"})
+        for client in obeyed:
+            client.answer(describe(self.driver))
         for client in clients:
             client.socket.close()
 
@@ -166,27 +196,38 @@ class _Client:
 
     def __init__(self, connected: socket.socket) -> None:
         self.socket, self.line = connected, b""
+        self._reply: Callable[[], dict[str, Any] | None] = lambda: None
         self.deadline = time.monotonic() + PATIENCE
         connected.setblocking(False)
 
     def fileno(self) -> int:
         return self.socket.fileno()
 
-    def hear(self, driver: Driver) -> dict[str, Any] | None:
-        """Take what has come, and do what it says once it is a line; the answer to that, None if more is to come."""
+    def hear(self, driver: Driver) -> bool:
+        """Take what has come, and do what it says once it is a line; False if more is to come."""
+        refusal: dict[str, Any] | None = None
         try:
             part = self.socket.recv(LONGEST)
-        except OSError as error:
-            return {"error": str(error)}
-        self.line += part
-        if not part or len(self.line) > LONGEST:
-            return {"error": f"expected one line of at most {LONGEST} bytes"}
-        if not self.line.endswith(b"\n"):
-            return None
-        try:
-            return obey(driver, self.line.decode())
-        except ValueError as error:  # undecodable text among them
-            return {"error": str(error)}
+            self.line += part
+            if not part or len(self.line) > LONGEST:
+                refusal = {"error": f"expected one line of at most {LONGEST} bytes"}
+            elif not self.line.endswith(b"\n"):
+                return False
+            else:
+                self._reply = obey(driver, self.line.decode())
+        except (OSError, ValueError) as error:  # undecodable text among the latter
+            refusal = {"error": str(error)}
+        if refusal is not None:
+            self._reply = lambda: refusal
+        return True
+
+    def answered(self) -> bool:
+        """Answer, once there is something to say."""
+        reply = self._reply()
+        if reply is None:
+            return False
+        self.answer(reply)
+        return True
 
     def answer(self, reply: dict[str, Any]) -> None:
         """Say it, which fits into the socket, and hang up."""

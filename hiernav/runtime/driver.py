@@ -215,6 +215,11 @@ class Driver:
         """(2,) the present goal, world frame [m]."""
         return None if self._trip is None else self._trip.goal
 
+    @property
+    def ended(self) -> Trip | RunResult | None:
+        """The goal that ended last, be it that the robot has not been seen to stand since."""
+        return self._ended or self.last_result
+
     def truth(self) -> Truth | None:
         """What really is, where the robot is a simulated one."""
         return None if self._truth is None else self._truth()

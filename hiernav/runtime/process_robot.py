@@ -10,21 +10,24 @@ import subprocess
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
+from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
 from hiernav.runtime.robot_process import END, STATUS, TAKEN
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command
 
 
-def simulated(**arguments: Any) -> ProcessRobot:
+def simulated(realtime: RealtimeConfig | None = None, **arguments: Any) -> ProcessRobot:
     """A simulated robot in real time in a process of its own; arguments of `hiernav.runtime.sim_robot.make`."""
     # nothing is drawn there, and MuJoCo would take 0.1 s to find out with what
-    return ProcessRobot("hiernav.runtime.sim_robot:make", arguments, environment={"MUJOCO_GL": "off"})
+    environment = {"MUJOCO_GL": "off"}
+    return ProcessRobot("hiernav.runtime.sim_robot:make", arguments, environment=environment, realtime=realtime)
 
 
 class ProcessRobot:
@@ -39,6 +42,7 @@ class ProcessRobot:
         arguments: Mapping[str, Any] | None = None,
         patience: float = 20.0,
         environment: Mapping[str, str] | None = None,
+        realtime: RealtimeConfig | None = None,
     ) -> None:
         """
         Args:
@@ -46,6 +50,7 @@ class ProcessRobot:
             arguments: of that function, as JSON can hold them.
             patience: time the robot may take to start, to show its first frame, and to answer a `call` [s].
             environment: variables of that process besides those of this one.
+            realtime: what that process asks of the system; the defaults if None.
 
         What is wrong with the adapter shows where its first answer is waited for: by `control_period`, `action_dim`,
         `realtime`, `read` and `call`, as a `RobotGone` that says what in one line.
@@ -58,7 +63,8 @@ class ProcessRobot:
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._calls, theirs = socket.socketpair()
         self._patience = patience
-        settings = json.dumps({"robot": robot, "arguments": dict(arguments or {})})
+        asked = asdict(realtime or RealtimeConfig())
+        settings = json.dumps({"robot": robot, "arguments": dict(arguments or {}), "realtime": asked})
         with theirs:
             self.child = Child(
                 "hiernav.runtime.robot_process",

@@ -7,9 +7,10 @@ import gc
 import math
 import os
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 PR_SET_TIMERSLACK = 29
 MCL_CURRENT = 1
@@ -29,7 +30,7 @@ class RealtimeConfig:
     lock_memory: bool = True
     """Keep all pages in memory (mlockall)."""
     cpus: tuple[int, ...] | None = None
-    """CPUs this process may run on; None leaves the choice to the system."""
+    """CPUs that the control process and the robot's adapter may run on; None leaves the choice to the system."""
     rehearsal: float = 0.0025
     """Time before each tick from which on one is rehearsed, so that the caches are warm [s]; 0 for none."""
     freeze_gc: bool = True
@@ -38,6 +39,12 @@ class RealtimeConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.rehearsal < math.inf:
             raise ValueError(f"RealtimeConfig.rehearsal = {self.rehearsal} s must be finite and not negative")
+
+
+def realtime_of(values: Mapping[str, Any]) -> RealtimeConfig:
+    """A configuration from its `asdict`, be it by way of JSON."""
+    cpus = values["cpus"]
+    return RealtimeConfig(**{**values, "cpus": None if cpus is None else tuple(cpus)})
 
 
 def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:

@@ -27,7 +27,7 @@ import numpy as np
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.gathering import Gathering
 from hiernav.runtime.mailbox import Mailbox, mapped
-from hiernav.runtime.realtime import request_realtime
+from hiernav.runtime.realtime import RealtimeConfig, realtime_of, request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
 from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 
@@ -50,7 +50,7 @@ def main() -> None:
     try:
         robot = make_robot(settings["robot"], settings["arguments"])
         leave_signals_to_parent()  # once more: the robot's driver may have seen to them
-        adapter = Adapter(robot, news, calls, descriptor)
+        adapter = Adapter(robot, news, calls, descriptor, realtime_of(settings["realtime"]))
     except BaseException as error:
         if _frames(error):
             _tell([error])
@@ -95,8 +95,10 @@ def make_robot(name: str, arguments: dict[str, Any]) -> Robot:
 class Adapter:
     """Hands commands to the robot as they come, and frames back; brakes if none came in time."""
 
-    def __init__(self, robot: Robot, news: int, calls: int, descriptor: int) -> None:
-        self.robot = robot
+    def __init__(
+        self, robot: Robot, news: int, calls: int, descriptor: int, realtime: RealtimeConfig | None = None
+    ) -> None:
+        self.robot, self._realtime = robot, realtime
         self._period = robot.control_period
         self.watchdog = CommandWatchdog(self._period)
         self._news, self._calls = news, calls
@@ -139,7 +141,7 @@ class Adapter:
     def _follow(self) -> bool:
         """Hand commands over and frames back. True once this process is not needed any more, False if it is alone."""
         robot, idle = self.robot, 0.25 * self._period
-        granted = request_realtime()
+        granted = request_realtime(self._realtime)
         period, action_dim = float(robot.control_period), int(robot.action_dim)
         facts = {"control_period": period, "action_dim": action_dim, "realtime": granted}
         self._publish()

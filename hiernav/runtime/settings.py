@@ -40,14 +40,14 @@ _SECTIONS: dict[str, Any] = {
 
 
 def load_settings(
-    path: Path | None = None,
+    paths: Sequence[Path] = (),
     overrides: Sequence[str] = (),
     defaults: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Settings:
-    """Defaults, then the file, then `section.key=value` overrides.
+    """Defaults, then the files, each over those before it, then `section.key=value` overrides.
 
     Args:
-        path: YAML file with some of the sections.
+        paths: YAML files with some of the sections.
         overrides: as on the command line.
         defaults: values by section and key that the robot itself asks for.
 
@@ -56,12 +56,14 @@ def load_settings(
             file or the command line, whichever it came from.
     """
     values = {name: dict(section) for name, section in (defaults or {}).items()}
-    if path is not None:
+    sources: dict[str, str] = {}
+    for path in paths:
         for name, section in _read(path).items():
             _known(name, list(_SECTIONS), str(path))
             if not isinstance(section, dict):
                 raise ConfigError(f"{path}: {name} must be a section with settings, it is {section!r}")
             values.setdefault(name, {}).update(section)
+            sources[name] = str(path)
     given: dict[str, dict[str, Any]] = {}
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -71,9 +73,13 @@ def load_settings(
         _known(name, list(_SECTIONS), "command line")
         _known(leaf, _keys(name), f"command line: {name}")
         given.setdefault(name, {})[leaf] = parse_yaml(text, f"command line: {key}")
-    source = "settings" if path is None else str(path)
     names = [name for name in _SECTIONS if name in values or name in given]
-    return Settings(**{name: _section(name, values.get(name, {}), given.get(name, {}), source) for name in names})
+    return Settings(
+        **{
+            name: _section(name, values.get(name, {}), given.get(name, {}), sources.get(name, "settings"))
+            for name in names
+        }
+    )
 
 
 def _section(name: str, values: Mapping[str, Any], given: Mapping[str, Any], source: str) -> Any:

@@ -66,11 +66,35 @@ def test_a_stop_latches_until_it_is_acknowledged_and_leads_to_ready_not_to_runni
     until(path, mode="running")
     tell(path, "stop")
     until(path, mode="estop", fault="stop was commanded", goal=None)
-    tell(path, "goal 1.0,0")
-    time.sleep(0.1)
+    assert "estop takes no goals until it is acknowledged: stop was commanded" in tell(path, "goal 1.0,0")["error"]
     assert tell(path, "status")["mode"] == "estop"
     tell(path, "acknowledge")
     until(path, mode="ready", fault=None, goal=None)
+
+
+def test_a_command_is_answered_once_it_has_taken_effect(serving):
+    _, path = serving
+    until(path, mode="ready")
+    assert tell(path, "goal 1.9,0")["goal"] == [1.9, 0.0]
+    assert tell(path, "pause")["mode"] in ("armed", "hold")
+    assert tell(path, "cancel")["goal"] is None
+    assert tell(path, "stop")["mode"] == "estop"
+    assert tell(path, "acknowledge")["mode"] == "ready"
+
+
+def test_a_goal_that_is_refused_is_answered_with_why(serving):
+    _, path = serving
+    until(path, mode="ready")
+    answer = tell(path, "goal 50,50")
+    assert answer["refused"] == answer["last"]["reason"] == "goal_outside" and "50" in answer["error"]
+    assert "refused" not in tell(path, "goal 1.9,0"), "the goal before it"
+
+
+def test_a_loop_that_does_not_tick_answers_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "PATIENCE", 0.2)
+    driver = driver_of(Puck(control_period=0.02))
+    with ControlServer(driver, tmp_path / "control.sock"):
+        assert tell(tmp_path / "control.sock", "goal 1.9,0")["goal"] is None
 
 
 @pytest.mark.parametrize("command", ["goal", "goal a,b", "goal nan,0", "goal 1,2,3", "dance", "cancel now", "", "  "])

@@ -170,7 +170,7 @@ def test_half_speed_is_half_the_speed_of_the_robots_that_ship(name, full):
 
     def speed_after(seconds: float, scale: float) -> float:
         robot = SimRobot(get_robot(name), sample_layout(parse_world("pillar(4,4,1)"), seed=1), EXACT)
-        guard = Guard(2, load_settings(ROOT / "deploy" / f"{name}.yaml").guard)
+        guard = Guard(2, load_settings([ROOT / "deploy" / f"{name}.yaml"]).guard)
         action = np.array([1.0, 0.0 if name == "point" else 1.0])
         for _ in range(round(seconds / robot.control_period)):
             robot.send(guard.check(action, speed=scale).action)

@@ -21,6 +21,7 @@ from shipped import ROOT
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.process_robot import ProcessRobot, simulated
+from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
 from hiernav.runtime.robot_process import LAST_BRAKES, STATUS, Adapter, make_robot
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command, encode_frame
@@ -70,6 +71,19 @@ def test_commands_reach_the_robot_and_frames_come_back(tmp_path):
         robot.close()
     done = [line.split()[0] for line in log.read_text().splitlines()]
     assert "send" in done and done[-2:] == ["brake", "close"]
+
+
+def test_the_adapter_asks_for_what_the_settings_say(tmp_path):
+    allowed = sorted(os.sched_getaffinity(0))
+    asked = RealtimeConfig(fifo_priority=None, lock_memory=False, cpus=(allowed[-1],))
+    robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log")}, realtime=asked)
+    try:
+        granted = dict(robot.realtime)
+        assert os.sched_getaffinity(robot.child.process.pid) == {allowed[-1]}
+    finally:
+        robot.close()
+    assert granted["cpu_affinity"] == f"granted: CPU {allowed[-1]}"
+    assert granted["sched_fifo"] == granted["mlockall"] == "not asked"
 
 
 def test_a_robot_is_released_at_once_where_it_stands_and_else_after_a_second_of_brakes(tmp_path):

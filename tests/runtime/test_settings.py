@@ -17,7 +17,7 @@ from hiernav.runtime.settings import Settings, load_settings
 
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
 def test_the_settings_that_ship_can_be_read(robot):
-    settings = load_settings(ROOT / "deploy" / f"{robot}.yaml")
+    settings = load_settings([ROOT / "deploy" / f"{robot}.yaml"])
     assert settings != Settings()
 
 
@@ -25,9 +25,22 @@ def test_the_command_line_goes_over_the_file_and_the_file_over_the_robot(tmp_pat
     file = tmp_path / "s.yaml"
     file.write_text("guard: {slow_ttc: 0.5}\ndriver: {max_steps: 7}\n")
     asked = {"driver": {"max_steps": 3, "robot_radius": 0.2}}
-    settings = load_settings(file, ["guard.slow_ttc=0.7", "realtime.cpus=[0, 1]"], asked)
+    settings = load_settings([file], ["guard.slow_ttc=0.7", "realtime.cpus=[0, 1]"], asked)
     assert (settings.guard.slow_ttc, settings.driver.max_steps, settings.driver.robot_radius) == (0.7, 7, 0.2)
     assert settings.realtime.cpus == (0, 1)
+
+
+def test_a_file_goes_over_those_before_it_and_is_blamed_for_what_it_says(tmp_path: Path):
+    """Whoever adds a setting of his own must not lose the limits that ship with the robot."""
+    own = tmp_path / "own.yaml"
+    own.write_text("estimator: {gyro_sigma: 0.05}\nguard: {slew_limit: 0.3}\n")
+    shipped = ROOT / "deploy" / "doggo.yaml"
+    settings = load_settings([shipped, own])
+    assert settings.estimator.gyro_sigma == 0.05 and settings.guard.slew_limit == 0.3
+    assert settings.guard.tilt_limit == load_settings([shipped]).guard.tilt_limit == 1.31
+    own.write_text("guard: {slew_limit: -1}\n")
+    with pytest.raises(ConfigError, match=r"own.yaml: guard: .*slew_limit = -1"):
+        load_settings([shipped, own])
 
 
 @pytest.mark.parametrize(
@@ -44,7 +57,7 @@ def test_the_command_line_goes_over_the_file_and_the_file_over_the_robot(tmp_pat
 )
 def test_what_is_not_a_setting_is_refused_with_its_name(override, why):
     with pytest.raises(ConfigError) as refused:
-        load_settings(None, [override])
+        load_settings([], [override])
     assert why in str(refused.value)
 
 
@@ -75,13 +88,13 @@ def test_what_is_not_finite_is_refused_wherever_it_stands_with_key_and_value(tmp
     for at in range(length or 1):
         given = text if length is None else str(["0.1"] * at + [text] + ["0.1"] * (length - at - 1)).replace("'", "")
         with pytest.raises(ConfigError) as refused:
-            load_settings(None, [f"{place}={given}"])
+            load_settings([], [f"{place}={given}"])
         said = str(refused.value)
         assert said.startswith(f"command line: {place}: ") and str(value) in said
         file = tmp_path / "s.yaml"
         file.write_text(f"{section}: {{{key}: {given}}}\n")
         with pytest.raises(ConfigError, match=rf"s\.yaml: {section}: .*{value}"):
-            load_settings(file)
+            load_settings([file])
 
 
 @pytest.mark.parametrize(
@@ -96,7 +109,7 @@ def test_what_the_command_line_got_wrong_is_not_blamed_on_the_file(tmp_path: Pat
     file = tmp_path / "s.yaml"
     file.write_text("guard: {tilt_limit: 0.5}\n")
     with pytest.raises(ConfigError) as refused:
-        load_settings(file, ["guard.slew_limit=0.3", override])
+        load_settings([file], ["guard.slew_limit=0.3", override])
     assert str(refused.value).startswith(says)
 
 
@@ -104,8 +117,8 @@ def test_what_the_file_got_wrong_is_not_blamed_on_the_command_line(tmp_path: Pat
     file = tmp_path / "s.yaml"
     file.write_text("guard: {slow_ttc: -1}\n")
     with pytest.raises(ConfigError, match=r"s\.yaml: guard: "):
-        load_settings(file, ["guard.slew_limit=0.3"])
-    assert load_settings(file, ["guard.slow_ttc=0.5"]).guard.slow_ttc == 0.5
+        load_settings([file], ["guard.slew_limit=0.3"])
+    assert load_settings([file], ["guard.slow_ttc=0.5"]).guard.slow_ttc == 0.5
 
 
 @pytest.mark.parametrize("text", ["- 1", "guard: 3", "guard: [1]", "nothing: {}", "guard: {low: x}"])
@@ -113,4 +126,4 @@ def test_a_malformed_file_is_refused_with_its_name(tmp_path: Path, text: str):
     file = tmp_path / "s.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"s\.yaml"):
-        load_settings(file)
+        load_settings([file])

@@ -76,7 +76,7 @@ def test_a_robot_that_is_driven_at_a_wall_meets_it_slowly(name, heading, share):
     wall = map_with((0.0, 1.3, 2.9, 0.3), half=3.0)
     open_field = sample_layout(parse_world("pillar(3,3,1)"), seed=1)
     layout = replace(open_field, pillars=np.array([[2.8, -2.8]]), start=np.array([0.0, -1.5, heading]))
-    settings = load_settings(ROOT / "deploy" / f"{name}.yaml").guard
+    settings = load_settings([ROOT / "deploy" / f"{name}.yaml"]).guard
 
     def speed_at_the_wall(config: GuardConfig) -> float:
         robot, guard = SimRobot(get_robot(name), layout, EXACT), Guard(2, config)
