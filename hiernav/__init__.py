@@ -14,10 +14,13 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
+    from hiernav.nav.bundle import Bundle, BundleError, load_bundle
+    from hiernav.nav.mapfile import load_map
     from hiernav.nav.observation import ObservationLayout
     from hiernav.nav.occupancy import OccupancyMap, VisitMap
     from hiernav.nav.option import HierarchicalAgent, Planner, ReplanRule, TerminationReason, WaypointOption
     from hiernav.nav.search import PathField
+    from hiernav.runtime.policy import make_agent
     from hiernav.sim.batch import BatchSim
     from hiernav.sim.robots import get_robot
     from hiernav.sim.worlds import parse_world, sample_layout
@@ -27,6 +30,10 @@ _HOME = {
     "TrainConfig": "hiernav.config",
     "dump_config": "hiernav.config",
     "load_config": "hiernav.config",
+    "Bundle": "hiernav.nav.bundle",
+    "BundleError": "hiernav.nav.bundle",
+    "load_bundle": "hiernav.nav.bundle",
+    "load_map": "hiernav.nav.mapfile",
     "ObservationLayout": "hiernav.nav.observation",
     "OccupancyMap": "hiernav.nav.occupancy",
     "VisitMap": "hiernav.nav.occupancy",
@@ -36,6 +43,7 @@ _HOME = {
     "TerminationReason": "hiernav.nav.option",
     "WaypointOption": "hiernav.nav.option",
     "PathField": "hiernav.nav.search",
+    "make_agent": "hiernav.runtime.policy",
     "BatchSim": "hiernav.sim.batch",
     "get_robot": "hiernav.sim.robots",
     "parse_world": "hiernav.sim.worlds",
@@ -44,6 +52,8 @@ _HOME = {
 
 __all__ = [
     "BatchSim",
+    "Bundle",
+    "BundleError",
     "ConfigError",
     "HierarchicalAgent",
     "ObservationLayout",
@@ -58,7 +68,10 @@ __all__ = [
     "__version__",
     "dump_config",
     "get_robot",
+    "load_bundle",
     "load_config",
+    "load_map",
+    "make_agent",
     "parse_world",
     "sample_layout",
 ]

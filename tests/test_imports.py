@@ -14,7 +14,7 @@ import hiernav
 PACKAGE = Path(hiernav.__file__).parent
 # Room -> the rooms it may import. A room is a folder or a file directly under hiernav/.
 ALLOWED = {
-    "__init__": {"config", "nav", "sim", "envs"},
+    "__init__": {"config", "nav", "sim", "envs", "runtime"},
     "__main__": {"cli"},
     "envs": set(),
     "decode": {"nav"},
