@@ -180,6 +180,8 @@ def _port(text: str) -> int:
 def _tell(arguments: argparse.Namespace) -> int:
     answer = tell(arguments.control or default_socket(), arguments.tell)
     print(json.dumps(answer, indent=2))
+    if "taken" in answer:
+        return FAULT
     if "refused" in answer:
         return BAD_GOAL
     return BAD_INPUT if "error" in answer else OK

@@ -642,7 +642,7 @@ def _check_machine(config: TrainConfig) -> None:
 
 def _check_data(config: TrainConfig) -> None:
     """Refuse a data set that is not there or that this run cannot learn from, before a run folder is made."""
-    if config.planner.data is not None:
+    if config.planner.data is not None and config.skill.preset != "baseline":  # which has no planner
         from hiernav.planner.train import settings_of_data
 
         settings_of_data(config)

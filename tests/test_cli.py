@@ -463,6 +463,11 @@ def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
     assert "has 6 samples, 60,000 are wanted" in line and not run.exists()
 
 
+def test_a_baseline_has_no_use_for_a_data_set():
+    config = load_config(None, ["skill.preset=baseline", "planner.data=nowhere"])
+    cli._check_data(config)
+
+
 def start(*arguments: str) -> subprocess.Popen[str]:
     command: Sequence[str] = (sys.executable, "-m", "hiernav.cli", *arguments)
     # where the tests run in the background of a shell, Ctrl-C is ignored by all that they start

@@ -279,6 +279,7 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
     [
         ({"mode": "running"}, 0),
         ({"error": "unknown command"}, 2),
+        ({"mode": "running", "taken": False, "error": "the loop stands"}, 1),
         ({"mode": "ready", "refused": "goal_outside", "error": "outside"}, 4),
     ],
 )

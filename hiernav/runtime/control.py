@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.runtime.driver import Driver
-from hiernav.runtime.trip import REFUSALS
+from hiernav.runtime.ticket import Ticket
 
 LONGEST = 256
 """Bytes of a command."""
@@ -61,41 +61,42 @@ def obey(driver: Driver, command: str) -> Callable[[], dict[str, Any] | None]:
 
     Returns:
         What tells the state that this has led to, and None before it has taken effect: a loop takes its commands at the
-        beginning of a tick. Of a goal that it refused then, the answer says so (`refused`, `error`).
+        beginning of a tick. The answer has an `error` where a goal is not driven to (`refused`: why, in one word), and
+        where the command was not `taken`.
 
     Raises:
-        ValueError: it says nothing that is known, or a goal is set that would not be driven to before a fault or stop
-            is acknowledged.
+        ValueError: it says nothing that is known.
     """
     word, _, rest = command.strip().partition(" ")
-    before, ticks, late = driver.ended, driver.loop.ticks, time.monotonic() + PATIENCE
+    ticket: Ticket | None = None
     if word == "goal":
-        goal, supervisor = parse_point(rest.strip()), driver.supervisor
-        if supervisor.latched:
-            raise ValueError(f"{supervisor.mode.value} takes no goals until it is acknowledged: {supervisor.fault}")
-        driver.set_goal(goal)
+        ticket = driver.set_goal(parse_point(rest.strip()))
     elif rest or word not in (known.split()[0] for known in COMMANDS):
         raise ValueError(f"unknown command {command.strip()!r}; known: {', '.join(COMMANDS)}")
     elif word == "stop":
-        driver.estop("stop was commanded")
+        ticket = driver.estop("stop was commanded")
     elif word != "status":
-        getattr(driver, word)()
+        ticket = getattr(driver, word)()
+    late = time.monotonic() + PATIENCE
 
     def answer() -> dict[str, Any] | None:
-        # the tick that runs now may have taken its commands already, the next one is done when the one after it begins
-        if word not in ("status", "quit") and driver.loop.ticks < ticks + 2 and time.monotonic() < late:
-            return None
-        ended = driver.ended
-        if word == "goal" and ended is not before and ended is not None and ended.reason in REFUSALS:
-            return {**describe(driver), "refused": ended.reason, "error": ended.detail or ended.reason}
-        return describe(driver)
+        if ticket is None or ticket.settled(driver.loop.ticks) and not ticket.dropped:
+            refused = None if ticket is None else ticket.refused
+            if ticket is None or refused is None:
+                return describe(driver)
+            return {**describe(driver), "refused": refused, "error": ticket.why or refused}
+        if ticket.dropped:
+            return {**describe(driver), "taken": False, "error": ticket.why}
+        if ticket.taken is None and time.monotonic() > late:
+            return {**describe(driver), "taken": False, "error": f"not taken within {PATIENCE:g} s: the loop stands"}
+        return describe(driver) if time.monotonic() > late else None
 
     return answer
 
 
 def describe(driver: Driver) -> dict[str, Any]:
     """The state of a loop, in JSON's own types."""
-    estimate, ended, goal = driver.estimate, driver.ended, driver.goal
+    estimate, ended, goal = driver.estimate, driver.last_trip, driver.goal
     return {
         "mode": driver.supervisor.mode.value,
         "why": driver.supervisor.why,
@@ -174,7 +175,7 @@ class ControlServer:
                 obeyed.append(client)
             obeyed = [client for client in obeyed if not client.answered()]
             while len(obeyed) > CLIENTS:
-                obeyed.pop(0).answer(describe(self.driver))
+                obeyed.pop(0).answer({"taken": None, "error": "too many clients wait for their answers"})
             while clients and clients[0].deadline <= time.monotonic():
                 clients.pop(0).answer({"error": f"expected one line within {PATIENCE:g} s"})
             if self._server in ready:
@@ -186,7 +187,8 @@ class ControlServer:
                 if len(clients) > CLIENTS:
                     clients.pop(0).answer({"error": "too many clients"})
         for client in obeyed:
-            client.answer(describe(self.driver))
+            if not client.answered():
+                client.answer({"taken": False, "error": "the loop has ended"})
         for client in clients:
             client.socket.close()
 

@@ -25,6 +25,7 @@ from hiernav.runtime.rehearsal import Rehearsal
 from hiernav.runtime.robot import Robot, RobotGone, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
+from hiernav.runtime.ticket import Ticket
 from hiernav.runtime.timing import TickTimer
 from hiernav.runtime.trip import RunResult, Trip
 from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, PlanWatch, SaturationWatch, StopWatch
@@ -144,9 +145,11 @@ class Driver:
         """Of the goal that ended last."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
-        self._requests: deque[Callable[[float], None]] = deque(maxlen=REQUESTS)
+        self._requests: deque[tuple[Ticket, Callable[[float], None]]] = deque()
+        self._stops: deque[Ticket] = deque(maxlen=REQUESTS)
         self._trip: Trip | None = None
         self._ended: Trip | None = None
+        self._last_trip: Trip | None = None
         self._estimate: Estimate | None = None
         self._restarts: int | None = None
         self._paused = self._serving = False
@@ -177,34 +180,51 @@ class Driver:
         self._serving = True
         self._loop()
 
-    def set_goal(self, goal: np.ndarray, max_steps: int | None = None) -> None:
+    def set_goal(self, goal: np.ndarray, max_steps: int | None = None) -> Ticket:
         """Drive to `goal` (2,), world frame [m], instead of to the present one if there is one.
 
         Raises:
             ValueError: the goal is not two finite numbers.
         """
-        goal = _checked_goal(goal)
-        self._requests.append(lambda now: self._start_trip(goal, max_steps, now))
+        goal, ticket = _checked_goal(goal), Ticket()
+        return self._ask(lambda now: self._start_trip(goal, max_steps, now, ticket), ticket)
 
-    def cancel(self) -> None:
+    def cancel(self) -> Ticket:
         """Give up the present goal, and stop."""
-        self._requests.append(lambda now: self._end_trip("cancelled", now))
+        return self._ask(lambda now: self._end_trip("cancelled", now))
 
-    def pause(self) -> None:
+    def pause(self) -> Ticket:
         """Wait, braked, until `resume`."""
-        self._requests.append(lambda now: setattr(self, "_paused", True))
+        return self._ask(lambda now: setattr(self, "_paused", True))
 
-    def resume(self) -> None:
+    def resume(self) -> Ticket:
         """Go on after `pause`."""
-        self._requests.append(lambda now: setattr(self, "_paused", False))
+        return self._ask(lambda now: setattr(self, "_paused", False))
 
-    def estop(self, why: str = "emergency stop") -> None:
+    def estop(self, why: str = "emergency stop") -> Ticket:
         """Brake, and stay braked until `acknowledge`."""
+        ticket = Ticket()
+        self._stops.append(ticket)
         self._stop_wanted = why
+        return ticket
 
-    def acknowledge(self) -> None:
+    def acknowledge(self) -> Ticket:
         """The cause of a fault or of an emergency stop is gone. The robot does not move before it gets a goal."""
-        self._requests.append(self._acknowledge)
+        return self._ask(self._acknowledge)
+
+    def _ask(self, request: Callable[[float], None], ticket: Ticket | None = None) -> Ticket:
+        """Have something done at the beginning of the next tick; of too many such requests, the oldest are dropped."""
+        ticket = ticket or Ticket()
+        while len(self._requests) >= REQUESTS:
+            self._drop_oldest(f"more than {REQUESTS} commands came within one tick")
+        self._requests.append((ticket, request))
+        return ticket
+
+    def _drop_oldest(self, why: str) -> None:
+        try:
+            self._requests.popleft()[0].drop(why)
+        except IndexError:  # the loop has just taken them
+            pass
 
     def quit(self) -> None:
         """End `run` or `serve` after the present tick."""
@@ -216,9 +236,9 @@ class Driver:
         return None if self._trip is None else self._trip.goal
 
     @property
-    def ended(self) -> Trip | RunResult | None:
-        """The goal that ended last, be it that the robot has not been seen to stand since."""
-        return self._ended or self.last_result
+    def last_trip(self) -> Trip | None:
+        """The goal that ended last, whether the robot has been seen to stand since or not."""
+        return self._last_trip
 
     def truth(self) -> Truth | None:
         """What really is, where the robot is a simulated one."""
@@ -233,8 +253,9 @@ class Driver:
         now = self.clock.now()
         if self.supervisor.mode is not Mode.INIT:
             self.supervisor.change(Mode.INIT, "new run", now)
-        self._requests.clear()
-        self._trip, self._ended, self._paused = None, None, False
+        while self._requests:
+            self._drop_oldest("the loop had not begun")
+        self._trip, self._ended, self._last_trip, self._paused = None, None, None, False
         self.gone = None
         self._told: tuple[str, str | None] = ("", None)
         self._estimate, self._restarts = None, None
@@ -371,10 +392,14 @@ class Driver:
     def _take_requests(self, now: float) -> None:
         self.audience.tell(lambda observer: observer.make_requests())
         for _ in range(len(self._requests)):
-            self._requests.popleft()(now)
+            ticket, request = self._requests.popleft()
+            request(now)
+            ticket.taken = self.loop.ticks
         if self._stop_wanted is not None:
             self._estop(self._stop_wanted, now)
             self._stop_wanted = None
+            while self._stops:
+                self._stops.popleft().taken = self.loop.ticks
 
     def _get_ready(self, estimate: Estimate, occupancy: OccupancyMap, now: float) -> None:
         """INIT -> READY -> ARMED, as far as there is a goal that can be driven to."""
@@ -508,10 +533,13 @@ class Driver:
             self._trip.steps += 1
         return sent, guarded.scale
 
-    def _start_trip(self, goal: np.ndarray, max_steps: int | None, now: float) -> None:
+    def _start_trip(self, goal: np.ndarray, max_steps: int | None, now: float, ticket: Ticket | None = None) -> None:
         """Take on a goal in the place of the present one; the robot keeps moving if the planner answers at once."""
         if self.supervisor.latched:
-            self._emit("goal", f"refused in {self.supervisor.mode.value}: {self.supervisor.fault}", now)
+            mode, fault = self.supervisor.mode.value, self.supervisor.fault
+            self._emit("goal", f"refused in {mode}: {fault}", now)
+            if ticket is not None:
+                ticket.refuse(mode, f"no goal is taken before {mode} is acknowledged: {fault}")
             return
         self._end_trip("changed", now)
         self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
@@ -524,6 +552,8 @@ class Driver:
         self._saturated = 0
         # last, and in `_end_trip` after the mode: a signal that comes between must not leave half of it
         self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps), None
+        if ticket is not None:
+            ticket.trip = self._trip
 
     def _end_trip(self, reason: str, now: float, detail: str = "") -> None:
         trip, supervisor = self._trip, self.supervisor
@@ -534,6 +564,7 @@ class Driver:
         if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
             supervisor.change(Mode.READY, reason, now)
         self._trip, self._ended = None, trip
+        self._last_trip = trip
         self._emit("end", detail or reason, now, reason=reason, steps=trip.steps, seconds=trip.seconds)
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:

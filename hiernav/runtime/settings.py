@@ -56,14 +56,16 @@ def load_settings(
             file or the command line, whichever it came from.
     """
     values = {name: dict(section) for name, section in (defaults or {}).items()}
-    sources: dict[str, str] = {}
+    sources: dict[str, list[tuple[str, str | None]]] = {}
     for path in paths:
         for name, section in _read(path).items():
             _known(name, list(_SECTIONS), str(path))
             if not isinstance(section, dict):
                 raise ConfigError(f"{path}: {name} must be a section with settings, it is {section!r}")
+            for key in section:
+                _known(key, _keys(name), f"{path}: {name}")
             values.setdefault(name, {}).update(section)
-            sources[name] = str(path)
+            sources.setdefault(name, []).append((str(path), _error(name, values[name])))
     given: dict[str, dict[str, Any]] = {}
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -75,26 +77,28 @@ def load_settings(
         given.setdefault(name, {})[leaf] = parse_yaml(text, f"command line: {key}")
     names = [name for name in _SECTIONS if name in values or name in given]
     return Settings(
-        **{
-            name: _section(name, values.get(name, {}), given.get(name, {}), sources.get(name, "settings"))
-            for name in names
-        }
+        **{name: _section(name, values.get(name, {}), given.get(name, {}), sources.get(name, [])) for name in names}
     )
 
 
-def _section(name: str, values: Mapping[str, Any], given: Mapping[str, Any], source: str) -> Any:
+def _section(
+    name: str, values: Mapping[str, Any], given: Mapping[str, Any], sources: Sequence[tuple[str, str | None]]
+) -> Any:
     """A section of `values` with what was `given` on the command line over it.
 
+    Args:
+        sources: files that the values are from, each with what was wrong with them after it was read.
+
     Raises:
-        ConfigError: names `source`, or the command line where the section could be used without what was given there.
+        ConfigError: names the first file with which it was wrong, or the command line where the section could be used
+            without what was given there.
     """
-    for key in values:
-        _known(key, _keys(name), f"{source}: {name}")
     error = _error(name, {**values, **given})
     if error is None:
         return msgspec.convert({**values, **given}, _SECTIONS[name])
     if not given or _error(name, values) == error:
-        raise ConfigError(f"{source}: {name}: {error}")
+        file = next((file for file, wrong in sources if wrong == error), "settings")
+        raise ConfigError(f"{file}: {name}: {error}")
     blamed = [key for key in given if key in error] or list(given)
     raise ConfigError(f"command line: {', '.join(f'{name}.{key}' for key in blamed)}: {error}")
 

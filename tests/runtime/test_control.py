@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,10 @@ from puck import Puck, driver_of
 
 from hiernav.runtime import control
 from hiernav.runtime.clock import MonotonicClock
-from hiernav.runtime.control import ControlServer, tell
-from hiernav.runtime.driver import Driver
+from hiernav.runtime.control import ControlServer, obey, tell
+from hiernav.runtime.driver import REQUESTS, Driver
+from hiernav.runtime.robot import SensorFrame
+from hiernav.runtime.supervisor import Mode
 
 
 @pytest.fixture
@@ -66,7 +68,8 @@ def test_a_stop_latches_until_it_is_acknowledged_and_leads_to_ready_not_to_runni
     until(path, mode="running")
     tell(path, "stop")
     until(path, mode="estop", fault="stop was commanded", goal=None)
-    assert "estop takes no goals until it is acknowledged: stop was commanded" in tell(path, "goal 1.0,0")["error"]
+    answer = tell(path, "goal 1.0,0")
+    assert answer["refused"] == "estop" and "before estop is acknowledged: stop was commanded" in answer["error"]
     assert tell(path, "status")["mode"] == "estop"
     tell(path, "acknowledge")
     until(path, mode="ready", fault=None, goal=None)
@@ -87,14 +90,66 @@ def test_a_goal_that_is_refused_is_answered_with_why(serving):
     until(path, mode="ready")
     answer = tell(path, "goal 50,50")
     assert answer["refused"] == answer["last"]["reason"] == "goal_outside" and "50" in answer["error"]
-    assert "refused" not in tell(path, "goal 1.9,0"), "the goal before it"
+    tell(path, "goal 1.9,0")
+    tell(path, "cancel")
+    answer = tell(path, "goal -1.9,0")
+    assert "refused" not in answer, "that was the goal before it"
+    assert answer["goal"] == [-1.9, 0.0] and answer["last"]["reason"] == "cancelled"
 
 
-def test_a_loop_that_does_not_tick_answers_all_the_same(tmp_path, monkeypatch):
+def answers_to(*commands: str) -> list[dict[str, object]]:
+    """What those are answered who give these commands within one tick of a loop that is ready."""
+    replies: list[Callable[[], dict[str, object] | None]] = []
+    early: list[dict[str, object] | None] = []
+    answers: list[dict[str, object]] = []
+    modes: list[Mode] = []
+
+    class Commanded(Puck):
+        def read(self) -> SensorFrame:
+            tick = self.log.count("read")
+            if tick == 20:
+                modes.append(driver.supervisor.mode)
+                replies.extend(obey(driver, command) for command in commands)
+                early.extend(reply() for reply in replies)
+            if tick == 21:
+                driver.quit()
+                answers.extend(reply() or {} for reply in replies)
+            return super().read()
+
+    driver = driver_of(Commanded(noise=1e-3))
+    driver.serve()
+    assert modes == [Mode.READY] and len(answers) == len(commands)
+    assert all(answer is None or answer["taken"] is False for answer in early), "nothing has taken effect"
+    return answers
+
+
+def test_whoever_sets_a_goal_is_told_of_that_goal():
+    bad, good = answers_to("goal 50,50", "goal 1.9,0")
+    assert (bad["refused"], bad["error"]) == ("changed", "changed") and "refused" not in good
+    good, bad = answers_to("goal 1.9,0", "goal 50,50")
+    assert good["refused"] == "changed" and bad["refused"] == "goal_outside" and "(50, 50)" in str(bad["error"])
+
+
+def test_a_goal_that_a_stop_overtakes_is_refused():
+    goal, stop = answers_to("goal 1.9,0", "stop")
+    assert (goal["refused"], goal["error"], stop["mode"]) == ("estop", "stop was commanded", "estop")
+    assert "error" not in stop
+
+
+def test_commands_that_are_too_many_for_a_tick_are_told_so():
+    first, *others = answers_to("pause", *["goal 1.9,0"] * REQUESTS)
+    assert first["taken"] is False and "16 commands" in str(first["error"])
+    assert all("taken" not in other for other in others)
+
+
+def test_a_loop_that_does_not_tick_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(control, "PATIENCE", 0.2)
     driver = driver_of(Puck(control_period=0.02))
     with ControlServer(driver, tmp_path / "control.sock"):
-        assert tell(tmp_path / "control.sock", "goal 1.9,0")["goal"] is None
+        for command in ("goal 1.9,0", "stop"):
+            answer = tell(tmp_path / "control.sock", command)
+            assert answer["taken"] is False and "the loop stands" in answer["error"]
+        assert "error" not in tell(tmp_path / "control.sock", "status")
 
 
 @pytest.mark.parametrize("command", ["goal", "goal a,b", "goal nan,0", "goal 1,2,3", "dance", "cancel now", "", "  "])

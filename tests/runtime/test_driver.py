@@ -290,7 +290,9 @@ def test_a_service_gives_the_first_fix_its_time_from_the_goal_on():
 
 @pytest.mark.parametrize("reason", ["goal", "cancelled"])
 def test_a_signal_between_the_end_of_a_trip_and_its_change_of_mode_leaves_them_agreed(reason):
-    driver = driver_of(pilot=Scripted(lambda step, straight: driver.cancel() or straight) if reason != "goal" else None)
+    driver = driver_of(
+        pilot=Scripted(lambda step, straight: (driver.cancel(), straight)[1]) if reason != "goal" else None
+    )
     change = driver.supervisor.change
 
     def change_late(mode: Mode, why: str, now: float) -> None:

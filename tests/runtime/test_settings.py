@@ -41,6 +41,8 @@ def test_a_file_goes_over_those_before_it_and_is_blamed_for_what_it_says(tmp_pat
     own.write_text("guard: {slew_limit: -1}\n")
     with pytest.raises(ConfigError, match=r"own.yaml: guard: .*slew_limit = -1"):
         load_settings([shipped, own])
+    with pytest.raises(ConfigError, match=r"own.yaml: guard: .*slew_limit = -1"):
+        load_settings([own, shipped])
 
 
 @pytest.mark.parametrize(
