@@ -270,6 +270,11 @@ def test_a_curve_has_a_line_for_every_seed(book):
     assert "ours (2 seeds)" in figure and ">reach rate<" in figure
 
 
+def test_a_mean_of_equal_values_is_that_value():
+    """A target is met by a mean that equals it, and the mean of three times 0.99 must not fall short by a rounding."""
+    assert of_seeds([0.99, 0.99, 0.99]).mean == 0.99
+
+
 def test_a_mean_curve_is_of_the_same_steps_and_of_the_same_settings():
     from matplotlib.figure import Figure
 
