@@ -59,8 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--list", action="store_true", help="run nothing: show every cell")
     parser.add_argument("--only", nargs="+", default=[], metavar="WHAT", help="experiments, cells, or patterns of them")
-    parser.add_argument("--seeds", type=_positive, metavar="N", help="of every training (5; 3 of the doggo's, "
-                        "of Table II and of ablations)")  # fmt: skip
+    parser.add_argument("--seeds", type=_positive, metavar="N", help="of every training (5; 3 of the doggo's, of "
+                        "Table II and of ablations of reward, curriculum, critics; 1 of the others)")  # fmt: skip
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS, help="(all)")
     parser.add_argument("--no-training", action="store_true", help="leave out what trains, or needs a training")
     parser.add_argument(
