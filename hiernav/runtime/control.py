@@ -80,16 +80,19 @@ def obey(driver: Driver, command: str) -> Callable[[], dict[str, Any] | None]:
     late = time.monotonic() + PATIENCE
 
     def answer() -> dict[str, Any] | None:
-        if ticket is None or ticket.settled(driver.loop.ticks) and not ticket.dropped:
-            refused = None if ticket is None else ticket.refused
-            if ticket is None or refused is None:
-                return describe(driver)
-            return {**describe(driver), "refused": refused, "error": ticket.why or refused}
+        if ticket is None:
+            return describe(driver)
         if ticket.dropped:
             return {**describe(driver), "taken": False, "error": ticket.why}
-        if ticket.taken is None and time.monotonic() > late:
-            return {**describe(driver), "taken": False, "error": f"not taken within {PATIENCE:g} s: the loop stands"}
-        return describe(driver) if time.monotonic() > late else None
+        if not ticket.settled(driver.loop.ticks):
+            if time.monotonic() < late:
+                return None
+            if ticket.taken is None:
+                why = f"not taken within {PATIENCE:g} s: the loop stands"
+                return {**describe(driver), "taken": False, "error": why}
+        if ticket.refused is not None:
+            return {**describe(driver), "refused": ticket.refused, "error": ticket.why or ticket.refused}
+        return describe(driver)
 
     return answer
 

@@ -392,7 +392,10 @@ class Driver:
     def _take_requests(self, now: float) -> None:
         self.audience.tell(lambda observer: observer.make_requests())
         for _ in range(len(self._requests)):
-            ticket, request = self._requests.popleft()
+            try:
+                ticket, request = self._requests.popleft()
+            except IndexError:  # somebody else has just dropped it for a newer one
+                break
             request(now)
             ticket.taken = self.loop.ticks
         if self._stop_wanted is not None:

@@ -29,9 +29,7 @@ class Ticket:
         self.refused, self.why = reason, why
 
     def settled(self, ticks: int) -> bool:
-        """Whether all is known, at a number of ticks that have begun."""
-        if self.dropped:
-            return True
+        """Whether it was taken and all is known of it, at a number of ticks that have begun."""
         if self.taken is None or ticks <= self.taken:
             return False
         trip = self.trip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -140,6 +141,25 @@ def test_commands_that_are_too_many_for_a_tick_are_told_so():
     first, *others = answers_to("pause", *["goal 1.9,0"] * REQUESTS)
     assert first["taken"] is False and "16 commands" in str(first["error"])
     assert all("taken" not in other for other in others)
+
+
+def test_a_flood_of_commands_from_other_threads_is_no_fault():
+    """What is dropped for a newer command, the loop may have been about to take."""
+
+    class Flooded(deque):
+        def __len__(self) -> int:
+            return super().__len__() + 1
+
+    class Commanded(Puck):
+        def read(self) -> SensorFrame:
+            driver._requests = Flooded()
+            if self.log.count("read") == 20:
+                driver.quit()
+            return super().read()
+
+    driver = driver_of(Commanded(noise=1e-3))
+    driver.serve()
+    assert driver.supervisor.fault is None
 
 
 def test_a_loop_that_does_not_tick_says_so(tmp_path, monkeypatch):
