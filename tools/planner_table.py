@@ -25,14 +25,14 @@ from bad_input import exit_code, whole
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-PAPER = {1_000: 3.05, 10_000: 1.57, 50_000: 1.15, 100_000: 0.96}
+from hiernav.report.paper import TABLE2
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/planner_table"), help="folder of runs and results")
     parser.add_argument(
-        "--samples", type=whole(), nargs="+", default=list(PAPER), help="sizes (1000 10000 50000 100000)"
+        "--samples", type=whole(), nargs="+", default=list(TABLE2), help="sizes (1000 10000 50000 100000)"
     )
     parser.add_argument("--presets", nargs="+", default=["paper", "default"], choices=("paper", "default"))
     parser.add_argument("--seeds", type=whole(0), nargs="+", default=[0, 1, 2], help="of training (0 1 2)")
@@ -124,7 +124,7 @@ def _print(results: dict[str, dict[str, Any]]) -> None:
             values = [r["collisions_mean"] for r in found]
             spread = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
             cells.append(f"{np.mean(values):.3f}{spread} ({len(values)})" if values else "-")
-        print(f"{samples:8,}  {PAPER.get(samples, float('nan')):10.2f}  " + "  ".join(f"{cell:>16}" for cell in cells))
+        print(f"{samples:8,}  {TABLE2.get(samples, float('nan')):10.2f}  " + "  ".join(f"{cell:>16}" for cell in cells))
     print("collisions per episode, mean over seeds ± standard deviation (seeds)")
 
 

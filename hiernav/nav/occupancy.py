@@ -151,6 +151,28 @@ class VisitMap:
         self._extent = occupancy.extent
         self._last_pixel: tuple[int, int] | None = None
 
+    def lies_on(self, occupancy: OccupancyMap) -> bool:
+        """Whether the grid is that of an occupancy map."""
+        return (
+            self.counts.shape == occupancy.occupied.shape
+            and self.origin == occupancy.origin
+            and self.resolution == occupancy.resolution
+        )
+
+    def moved_to(self, occupancy: OccupancyMap) -> VisitMap:
+        """The same visits on the grid of another occupancy map, such as one that has grown; those outside are lost."""
+        moved = VisitMap(occupancy)
+        visited = np.argwhere(self.counts)
+        centers = np.array(self.origin) + (visited[:, ::-1] + 0.5) * self.resolution
+        inside = occupancy.contains(centers)
+        counts = self.counts[tuple(visited.T)]
+        np.maximum.at(moved.counts, occupancy.pixel_of(centers[inside]), counts[inside])
+        if self._last_pixel is not None:
+            row, col = self._last_pixel
+            x, y = self.origin
+            moved._last_pixel = moved._pixel(x + (col + 0.5) * self.resolution, y + (row + 0.5) * self.resolution)
+        return moved
+
     def copy(self) -> VisitMap:
         """The visits so far."""
         copied = VisitMap.__new__(VisitMap)

@@ -283,8 +283,8 @@ class WaypointOption:
             occupancy = [self._predictors[row](now, stamp, where) for row, now, stamp, where in at_rows]
         for row, where, now in zip(rows.tolist(), position.tolist(), occupancy, strict=True):
             visits = self.visits[row]
-            if visits is None:
-                visits = self.visits[row] = VisitMap(now)
+            if visits is None or not visits.lies_on(now):
+                visits = self.visits[row] = VisitMap(now) if visits is None else visits.moved_to(now)
             visits.enter(*where)
         self.age[pick] += 1
         reason = self._reasons(rows, pick, position, goal, occupancy)
@@ -446,9 +446,12 @@ class HierarchicalAgent:
     layout: ObservationLayout
     control_period: float
     """Time between two calls of `act` [s]."""
+    axis: float = 0.0
+    """Bearing in the body frame that the robot drives along best [rad]; for `Recovery`."""
 
     def __post_init__(self) -> None:
-        self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
+        option = self.option
+        self.recovery = Recovery(option.num_rows, self.control_period, option.sweep_radius, axis=self.axis)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
         self._clocked = "clock" in self.layout.names
 
@@ -476,13 +479,59 @@ class HierarchicalAgent:
             stamps: (N,) when the maps were made, on any clock [s]; the time of the steps by default.
         """
         since = self._steps * self.control_period
-        step = self.option.step(pose[:, :2], goal, occupancy, stamps=since if stamps is None else stamps)
-        plan = self.recovery(pose, step.plan, occupancy)
-        self.option.waiting |= self.recovery.ended
-        guides = guided(self.recovery.dim(terms), pose, plan, goal, since if self._clocked else None)
-        observation = self.layout.build(guides)
+        step, plan, observation = observe(
+            self.option,
+            self.recovery,
+            self.layout,
+            pose,
+            terms,
+            goal,
+            occupancy,
+            since if self._clocked else None,
+            since if stamps is None else stamps,
+        )
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
+
+
+def observe(
+    option: WaypointOption,
+    recovery: Recovery | None,
+    layout: ObservationLayout,
+    pose: np.ndarray,
+    terms: Mapping[str, np.ndarray],
+    goal: np.ndarray,
+    occupancy: Sequence[OccupancyMap],
+    time: np.ndarray | None,
+    stamps: np.ndarray,
+    rows: np.ndarray | None = None,
+) -> tuple[OptionStep, np.ndarray, np.ndarray]:
+    """What a robot does in a control step up to its skill, in training as on the robot.
+
+    The option ends or goes on, whoever stands still gets a way out, and what guides the skill joins what is sensed.
+
+    Args:
+        option: plans of N robots.
+        recovery: of the same robots; None: nobody gets a way out.
+        layout: of the observation.
+        pose: (M, 3) world frame [m, m, rad].
+        terms: the robots' sensors by name, (M, d) each.
+        goal: (M, 2) world frame [m].
+        occupancy: M maps as they are now.
+        time: (M,) since the start of each episode [s]; None for a skill without a clock.
+        stamps: (M,) when the maps were made, on any clock [s].
+        rows: (M,) the rows these belong to; all N by default.
+
+    Returns:
+        The option's step, the plans (M, K, 2) that are followed, world frame [m], and observations (M, D) float32.
+    """
+    step = option.step(pose[:, :2], goal, occupancy, rows, stamps)
+    plan = step.plan
+    if recovery is not None:
+        plan = recovery(pose, plan, occupancy, rows)
+        option.waiting |= recovery.ended
+        terms = recovery.dim(terms, rows)
+    return step, plan, layout.build(guided(terms, pose, plan, goal, time))
 
 
 def guided(

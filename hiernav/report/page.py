@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
 from hiernav.reproduce.experiments import ABLATED, DEPARTURE_WORLDS, EXPERIMENTS, OF_LEGS, ROBOTS, TABLE3_ROBOT, WORLDS
+from hiernav.reproduce.results import Result
 from hiernav.run import write_atomically
 
 FILM_LIMIT = 120_000
@@ -25,8 +26,8 @@ _RECOVERY = (
     "this helps only a skill that follows waypoints, so the baseline never gets it."
 )
 _PREDICTION = (
-    "In gremlin, our plans are made on the map as it will be 0.9 s later; in the paper, and when our skills learned, "
-    "on the map as it is (what it is worth is among the ablations: <i>plans are made on maps as they are</i>)."
+    "In gremlin, our plans are made on the map as it will be 0.9 s later; in the paper, and when the skills that ship "
+    "learned, on the map as it is (what it is worth is among the ablations: <i>plans are made on maps as they are</i>)."
 )
 _TYPES = {".mp4": "video/mp4", ".gif": "image/gif"}
 
@@ -100,7 +101,7 @@ def _table3(book: Book) -> str:
         both = f"<h3>{robot}: reach rate</h3>{tables.table3(book, robot, 'reach_rate')}"
         both += f"<h3>{robot}: steps to the goal</h3>{tables.table3(book, robot, 'steps_mean')}"
         parts.append(both if robot == TABLE3_ROBOT else f"<details><summary>{robot}</summary>{both}</details>")
-    return "".join(parts) + _command("--only table3")
+    return "".join(parts) + _command(book, "--only table3")
 
 
 def _strict(book: Book) -> str:
@@ -109,7 +110,7 @@ def _strict(book: Book) -> str:
         "counts, leaving the field is a failure. SPL is success weighted by shortest over driven length. The dotted "
         "line is the target of 0.97. A* in the place of the learned planner is not in the paper.</p>",
         _gallery([(figures.reach(book, robot), f"{robot}: reach rate") for robot in reversed(ROBOTS)]),
-        _command("--only table3 astar"),
+        _command(book, "--only table3 astar"),
     ]
     for robot in reversed(ROBOTS):
         short = "".join(f"<li>{escape(text)}</li>" for text in shortfalls(book, robot))
@@ -121,13 +122,14 @@ def _strict(book: Book) -> str:
 
 def _table2(book: Book) -> str:
     return (
-        "<p>Collisions in an episode of a disc that walks along the waypoints, 1000 episodes in pillar(2,2,10), plans "
-        "unverified; every waypoint that touches an obstacle counts 1. <i>Its network, ours</i> is the published "
+        "<p>Collisions in an episode of a disc that walks along the waypoints, 1000 episodes in pillar(2,2,10); plans "
+        "are neither verified nor repaired, though of the six that <i>our network</i> proposes at once, one that is free "
+        "on the map is taken if there is any; every waypoint that touches an obstacle counts 1. <i>Its network, ours</i> is the published "
         "network trained here. Every set is seen at least six times, and small ones until there were 1,000 updates of "
         "256 samples: the largest set is more data and more updates at once. The paper does not tell its own.</p>"
         + _gallery([(figures.table2(book), "collisions of plans against samples")])
         + tables.table2(book)
-        + _command("--only table2")
+        + _command(book, "--only table2")
     )
 
 
@@ -140,7 +142,7 @@ def _unseen(book: Book) -> str:
         "unseen worlds); moving obstacles are at rest. <i>Verified</i>: what the robots drive by, the network’s plans "
         "swept against the map and repaired where they collide or lead away.</p>"
         + _by_robot(lambda robot: tables.walks(book, robot))
-        + _command("--only walks unseen")
+        + _command(book, "--only walks unseen")
     )
 
 
@@ -157,29 +159,31 @@ def _efficiency(book: Book) -> str:
     return (
         "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are "
         "seeds, thick ones the mean of those that are of the settings of now. The baseline sees the goal in the place "
-        "of waypoints; all else is the same, the scale of its rewards apart, which are larger. Returns in the curves "
-        "are by each one’s own reward and not to be compared; those in the table are of both by the baseline’s, as "
-        "in the paper, except that here it has terms that the paper’s lacks: leaving the field, tilting and falling "
-        "cost as well. The paper’s own curves are printed without numbers; its networks of Table III were trained for "
+        "of waypoints, and its reward is the distance to the goal in the place of the path’s terms and of ours; all else "
+        "is the same. Returns in the curves are by each one’s own reward and not to be compared; those in the table "
+        "are of both by the baseline’s, as in the paper, except that here it has terms that the paper’s lacks: leaving "
+        "the field, tilting and falling cost as well, the latter at every step on the back. Trainings by "
+        "several versions of this library stand side by side: <i>code</i> names them. The paper’s own curves are printed without numbers; its networks of Table III were trained for "
         f"3,000,000 steps.</p><p>{_RECOVERY}</p>"
         + (f'<p class="short">Failed: {escape(", ".join(failed))}.</p>' if failed else "")
         + _gallery(shown)
         + "<p>In the end, 1000 strict episodes in pillar(2,2,10) with A* plans:</p>"
         + tables.sample_efficiency(book)
-        + _command("--only sample_efficiency")
+        + _command(book, "--only sample_efficiency")
     )
 
 
 def _replanning(book: Book) -> str:
     return (
         "<p>The rule against fixed periods, with the bundles that ship; the paper’s rule planned every 8.5 steps of "
-        "the doggo (10 Hz; the car runs at 25 Hz, the point at 50 Hz).</p>"
+        "the doggo (10 Hz; the car runs at 25 Hz, the point at 50 Hz). With a fixed period nothing else ends a plan; a "
+        "robot that stands still gets a way out, and another plan behind it, under both.</p>"
         + _gallery([(figures.replanning(book, world), world) for world in DEPARTURE_WORLDS])
         + _by_robot(lambda robot: tables.replanning(book, robot))
         + "<h3>Trained with fixed periods, as in the paper</h3>"
         + f"<p>The {ABLATED} is trained so; the paper trained the doggo.</p>"
         + _by_robot(lambda robot: tables.trained_periods(book, robot))
-        + _command("--only replanning")
+        + _command(book, "--only replanning")
     )
 
 
@@ -192,7 +196,7 @@ def _ablations(book: Book) -> str:
         + "; ".join(escape(tables.WHAT[name]) for name in OF_LEGS)
         + ". Driven with A* plans, 1000 strict episodes in pillar(2,2,10); returns by the baseline’s reward.</p>"
         + _by_robot(lambda robot: tables.trained_ablations(book, robot))
-        + _command("--only ablations")
+        + _command(book, "--only ablations")
     )
 
 
@@ -209,9 +213,11 @@ def _films(book: Book, beside: Path) -> str:
             shown += [
                 (f'<p class="short">failed: {escape(r.error or "")}</p>', f"{robot}, {world}") for r in group.failed
             ]
+            if not (group.done or group.failed):
+                shown.append((None, f"{robot}, {world}"))
     return (
         "<p>The first episode of the strict protocol in each world, from above, three times as fast as it is; a tap "
-        "plays and stops it.</p>" + _gallery(shown, "films") + _command("--only films")
+        "plays and stops it.</p>" + _gallery(shown, "films") + _command(book, "--only films")
     )
 
 
@@ -248,9 +254,6 @@ def _last_frame(path: Path) -> str:
 
 def _provenance(book: Book) -> str:
     results = book.results
-    commits = Counter(
-        (result.commit or "no repository")[:10] + (" with changes" if result.dirty else "") for result in results
-    )
     machines = sorted(
         {
             ", ".join([m.cpu, f"{m.cores} cores", *([m.gpu] if m.gpu else []), m.system])
@@ -272,7 +275,8 @@ def _provenance(book: Book) -> str:
         "<p>Every number is from a file in <code>results/</code>, with its seed, commit, settings, machine, duration "
         "and the command that makes it.</p>",
         tables.table(["done", "failed", "not run yet", "took"], rows, "experiment"),
-        "<p>Commits: " + escape(", ".join(f"{name} ({count})" for name, count in commits.items()) or "none") + ".</p>",
+        f"<p>Commits: {_versions(results) or 'none'}. A result is made again when its settings or its bundle change, not "
+        "when the code does: what stands in one table may be of several versions.</p>",
         "<p>Machines: " + escape("; ".join(machines) or "none") + ".</p>",
         *(f"<p><small>{escape(text)}</small></p>" for text in versions),
     ]
@@ -283,7 +287,7 @@ def _provenance(book: Book) -> str:
     if failed:
         items = "".join(f"<li>{escape(r.id)}: {escape(r.error or '')}</li>" for r in failed)
         parts.append(f'<p class="short">Failed:</p><ul>{items}</ul>')
-    return "".join(parts) + _command("--list")
+    return "".join(parts) + _command(book, "--list")
 
 
 def _damaged(book: Book) -> str:
@@ -324,8 +328,17 @@ def _gallery(shown: list[tuple[str | None, str]], kind: str = "figures") -> str:
     return (f'<div class="{kind}">{"".join(parts)}</div>' if parts else "") + note
 
 
-def _command(options: str) -> str:
-    return f"<p class=cmd><code>python tools/reproduce.py {escape(options)}</code></p>"
+def _command(book: Book, options: str) -> str:
+    """What makes a section, and which versions of the code made it so far."""
+    made = [result for result in book.results if result.experiment in options.split()]
+    code = f"<p><small>Made by {_versions(made)}.</small></p>" if made else ""
+    return f"<p class=cmd><code>python tools/reproduce.py {escape(options)}</code></p>{code}"
+
+
+def _versions(results: Sequence[Result]) -> str:
+    """Commits with the number of results of each."""
+    names = [(r.commit or "no repository")[:7] + (" with changes" if r.dirty else "") for r in results]
+    return escape(", ".join(f"{name} ({count})" for name, count in Counter(names).items()))
 
 
 _CSS = """

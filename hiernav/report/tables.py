@@ -39,7 +39,7 @@ VARIANTS = {
 }
 WHAT = {
     "no-repair": "plans are not verified or repaired", "no-recovery": "a robot that stands still gets no way out",
-    "no-invalid-rule": "plans that meet the map are kept",
+    "no-invalid-rule": "plans are kept that meet the map, or were made on another one",
     "no-prediction": "plans are made on maps as they are, not as they will be", "paper-reward": "the paper's reward",
     "one-world": "trained in pillar(2,2,10) alone, as in the paper", "no-phase-in": "all worlds from the start",
     "no-mirror": "batches are not reflected", "no-average": "the last actor instead of the average",
@@ -95,8 +95,7 @@ def strict(book: Book, robot: str) -> str:
             if not book.knows(experiment, variant, robot):
                 continue
             group = book.group(experiment, variant, robot, world)
-            if group.done or group.failed or variant in ("baseline", "shipped", "ours", "finetuned", "astar"):
-                rows.append([f"{escape(world)}<br><small>{label}</small>", *(cell(group, name) for name in names)])
+            rows.append([f"{escape(world)}<br><small>{label}</small>", *(cell(group, name) for name in names)])
     return table([_HEADS[name] for name in names], rows, "world, policies")
 
 
@@ -127,6 +126,8 @@ def walks(book: Book, robot: str) -> str:
             share, count = found.verified.repairs, found.verified.proposals
             rows.append([first, *row, f"{100.0 * share / count:.1f} %" if count else "–"])
         rows += [[first, '<span class="short">failed</span>', *["–"] * 5] for _ in group.failed]
+        if not (group.done or group.failed):
+            rows.append([first, *[NOT_RUN] * 6])
     heads = [f"{what}<br><small>{who}</small>" for what, who in (
         ("collisions", "network"), ("collisions", "verified"), ("reach rate", "network"), ("reach rate", "verified"),
         ("reach rate", "A*"), ("repaired", "of the plans"),
@@ -138,7 +139,7 @@ def unseen(book: Book, robot: str) -> str:
     """Drives of the shipped bundle in worlds of other sizes and densities."""
     names = ("reach_rate", "steps_mean", "collisions_mean", "collision_free_rate", "spl_mean")
     groups = [(world, book.group("unseen", "shipped", robot, world)) for world in UNSEEN]
-    rows = [[escape(world), *(cell(g, name) for name in names)] for world, g in groups if g.done or g.failed]
+    rows = [[escape(world), *(cell(group, name) for name in names)] for world, group in groups]
     return table([_HEADS[name] for name in names], rows, "world")
 
 
@@ -191,7 +192,6 @@ def _beside_shipped(
 
 
 def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]]) -> str:
-    names = ("reach_rate", "steps_mean", "collisions_mean")
     known, rows = [kind for kind in kinds if book.knows(experiment, kind[1], kind[0])], list[list[str]]()
     if not known:
         return ""
@@ -199,9 +199,21 @@ def _trainings(book: Book, experiment: str, kinds: Iterable[tuple[str, str, str]
         group = book.group(experiment, variant, robot)
         if experiment != "sample_efficiency" and not rows:
             ours = book.group("sample_efficiency", "ours", robot)
-            rows.append([f"{robot}<br><small>ours</small>", *(cell(ours, n) for n in (*names, "return_mean"))])
-        rows.append([f"{robot}<br><small>{label}</small>", *(cell(group, n) for n in (*names, "return_mean"))])
-    return table([*(_HEADS[name] for name in names), "return"], rows, "robot, training")
+            rows.append(_training(ours, robot, "ours"))
+        rows.append(_training(group, robot, label))
+    return table([*(_HEADS[name] for name in _TRAINED), "return", "code"], rows, "robot, training")
+
+
+_TRAINED = ("reach_rate", "steps_mean", "collisions_mean")
+
+
+def _training(group: Group, robot: str, label: str) -> list[str]:
+    """What came of the trainings of a group, and the commits that trained."""
+    results = [*group.done, *group.failed]
+    code = [name for result in results for name in result.source.get("commits") or [result.commit or "no repository"]]
+    shown = "<br>".join(dict.fromkeys(escape(name[:7]) for name in code))
+    cells = [cell(group, name) for name in (*_TRAINED, "return_mean")]
+    return [f"{robot}<br><small>{label}</small>", *cells, f"<small>{shown}</small>" if shown else NOT_RUN]
 
 
 def cell(group: Group, name: str, protocol: str = "strict", bar: float | None = None) -> str:

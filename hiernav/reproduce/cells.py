@@ -70,7 +70,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def command(self) -> str:
         """What makes it, from the root of the repository."""
-        more = f" --seeds {self.seed + 1}" if self.seed is not None and self.seed >= 3 else ""
+        more = f" --seeds {self.seed + 1}" if self.seed else ""  # of some there is one seed unless more are asked for
         return f"python tools/reproduce.py --only {self.id}{more}"
 
 

@@ -176,6 +176,10 @@ class Queue:
         """
         watcher, tally = watcher or Watcher(), Tally()
         began = time.monotonic()
+        if not retry:
+            for entry in self.entries():
+                if entry.state in ("failed", "damaged"):
+                    tally.failed[entry.cell.id] = f"{entry.error} (before; --retry-failed runs it again)"
         try:
             for before in self._unsettled(retry):
                 cell = before.cell

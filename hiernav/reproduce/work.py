@@ -182,7 +182,8 @@ def _more(episodes: list[Episode]) -> dict[str, Any]:
         "collisions": [e.collisions for e in episodes],
         "spl": [e.spl for e in episodes],
     }
-    plans = sum(sum(count for reason, count in e.replans.items() if reason != "goal") for e in episodes)
+    ended = sum(sum(count for reason, count in e.replans.items() if reason != "goal") for e in episodes)
+    plans = ended + sum(e.recoveries for e in episodes)
     return {
         **{f"{name}_half95": _half_width(each) for name, each in values.items()},
         "steps_between_plans": sum(e.steps for e in episodes) / plans if plans else None,

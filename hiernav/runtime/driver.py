@@ -71,12 +71,14 @@ class DriverConfig:
     """A robot slower than this, three readings in a row, has stopped [m/s]."""
     stop_timeout: float = 3.0
     """Time the robot is given to stop [s]."""
+    max_recoveries: int = 20
+    """Recoveries on the way to one goal after which the robot is stuck, wherever they were."""
     predict: bool = True
     """Whether plans are made on maps as they will be where obstacles move (`hiernav.nav.prediction`)."""
 
     def __post_init__(self) -> None:
         for name, value in self.__dict__.items():
-            if name != "predict" and not (math.isfinite(value) and value > 0):
+            if not (isinstance(value, bool) or math.isfinite(value) and value > 0):
                 raise ValueError(f"DriverConfig.{name} = {value} must be finite and positive")
         if not self.plan_slow < self.plan_hold:
             raise ValueError(f"DriverConfig.plan_slow = {self.plan_slow} must be less than plan_hold")
@@ -126,10 +128,14 @@ class Driver:
             observers: told of every tick and event; one that raises is dropped.
             rehearsal: how long before each tick one is rehearsed to warm the caches [s]; 0, or a period of less than
                 four times that, does without.
+
+        Raises:
+            ValueError: the policies are for another control rate than the robot's, or the guard for other actuators.
         """
         self.robot, self.pilot, self.occupancy, self.clock = robot, pilot, occupancy, clock
         self.estimator = estimator or Estimator()
         self.guard = guard or Guard(robot.action_dim)
+        self._require_fit()
         self.config = config or DriverConfig()
         self.timer = timer or TickTimer(SECTIONS)
         self.audience = Audience(observers)
@@ -155,6 +161,15 @@ class Driver:
         self._paused = self._serving = False
         self._stop_wanted: str | None = None
         self._held_since = 0.0
+
+    def _require_fit(self) -> None:
+        trained, period = self.pilot.control_period, self.robot.control_period
+        if trained is not None and not math.isclose(trained, period, rel_tol=1e-6):
+            raise ValueError(f"Driver: the policies act every {trained:g} s, the robot every {period:g} s")
+        if self.guard.action_dim != self.robot.action_dim:
+            raise ValueError(
+                f"Driver: the guard is for {self.guard.action_dim} actuators, the robot has {self.robot.action_dim}"
+            )
 
     def run(self, goal: np.ndarray, max_steps: int | None = None) -> RunResult:
         """Drive to `goal` (2,), world frame [m], until it is reached or the run ends otherwise.
@@ -370,11 +385,13 @@ class Driver:
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
             self._choose_mode(self._trip, seen.decision, doubt if trust is Trust.HOLD else wait, stamp, now)
+        guarded = False
         if supervisor.driving and seen.decision is not None and estimate is not None and seen.occupancy is not None:
             seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, now)
+            guarded = True
         if seen.sent is None:
             self.robot.brake()
-            fallen = self.guard.braked(None if estimate is None else estimate.upright)
+            fallen = None if guarded else self.guard.braked(None if estimate is None else estimate.upright)
             if fallen is not None and not supervisor.latched:
                 self._fail(fallen, now)
             timer.mark("send")
@@ -447,6 +464,7 @@ class Driver:
         decision = self.pilot.act(now, estimate, terms, trip.goal, occupancy)
         if decision.reason is not TerminationReason.NONE:
             trip.replans[decision.reason.name.lower()] += 1
+        if decision.plan_seconds > 0.0:
             self.timer.mark_split("infer", "plan", decision.plan_seconds)
         else:
             self.timer.mark("infer")
@@ -500,6 +518,9 @@ class Driver:
             supervisor.change(Mode.RUNNING, "nothing to wait for any more", now)
             self._saturation.reset()
         if decision.recovering and supervisor.mode is Mode.RUNNING:
+            if trip.recoveries >= self.config.max_recoveries:
+                self._fail(f"stuck: {trip.recoveries} recoveries on the way to this goal", now)
+                return
             trip.recoveries += 1
             supervisor.change(Mode.RECOVERING, f"recovery {trip.recoveries}", now)
         elif not decision.recovering and supervisor.mode is Mode.RECOVERING:
@@ -517,6 +538,7 @@ class Driver:
             self._saturation.reset()
             self._saturated += 1
             if self._saturated > MAX_SATURATED:
+                self.guard.braked(estimate.upright)
                 self._fail(f"the action stays saturated, {MAX_SATURATED} recoveries did not help", now)
                 return None, 1.0
             self.pilot.recover()
@@ -529,6 +551,7 @@ class Driver:
         self.timer.mark("guard")
         if guarded.fault is not None:
             self._fail(guarded.fault, now)
+        if guarded.brake or guarded.fault is not None:
             return None, guarded.scale
         sent = self.robot.send(guarded.action)
         self.timer.mark("send")

@@ -77,6 +77,8 @@ class Estimator:
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
+        self._unsure = {"position_fix": 0, "magnetometer": 0}
+        """Sensors of which no reading agrees with the first one yet, and how many have not."""
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}
@@ -256,13 +258,20 @@ class Estimator:
             return
         yaw = self._field_heading - math.atan2(aside, ahead)
         variance = (self.config.magnetometer_sigma / level) ** 2 + 1e-4
+        miss = wrap(yaw - self._filter.yaw)
         if not self._has_yaw:
             self._has_yaw = True
             self._filter.replace((YAW,), (wrap(yaw),), variance)
-        elif not self._filter.correct_yaw(miss := wrap(yaw - self._filter.yaw), variance, self._gate_1):
-            if not self._reject("magnetometer", (miss,)):
-                return
+        elif self._filter.correct_yaw(miss, variance, self._gate_1):
+            self._unsure.pop("magnetometer", None)
+        elif self._unsure.get("magnetometer") is not None:
             self._filter.replace((YAW,), (wrap(yaw),), variance)
+            if not self._agrees_roughly("magnetometer", (miss,)):
+                return
+        elif self._reject("magnetometer", (miss,)):
+            self._filter.replace((YAW,), (wrap(yaw),), variance)
+        else:
+            return
         self._accept("magnetometer", self._stamp)
 
     def _correct_velocity(self, velocity: Vector | None, forward: Vector, left: Vector) -> None:
@@ -320,14 +329,18 @@ class Estimator:
         miss = (fix[0] - then[0], fix[1] - then[1])
         variance = self.config.fix_sigma**2
         x, y = self._filter.x[:2]
-        if self._has_position and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
+        first, self._has_position = not self._has_position, True
+        if not first and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
             self._shift_history(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
-        elif self._has_position and not self._reject("position_fix", miss):
-            return
+            self._unsure.pop("position_fix", None)
         else:
-            self._has_position = True
+            unsure = self._unsure.get("position_fix") is not None
+            if not (unsure or self._reject("position_fix", miss)):
+                return
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)
+            if unsure and not first and not self._agrees_roughly("position_fix", miss):
+                return
         self._accept("position_fix", stamp)
 
     def _position_at(self, stamp: float) -> tuple[float, float]:
@@ -372,6 +385,18 @@ class Estimator:
         self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
+    def _agrees_roughly(self, sensor: str, miss: tuple[float, ...]) -> bool:
+        """Whether a reading that took the place of the first one is to be believed, though it does not pass the gate.
+
+        Only where many others did not either: then the sensor is noisier than it is said to be.
+        """
+        self.counts[f"{sensor}_rejected"] += 1
+        self._unsure[sensor] += 1
+        if self._unsure[sensor] < self.config.reinit_after or math.hypot(*miss) > self.config.reinit_spread:
+            return False
+        del self._unsure[sensor]
+        return True
+
     def _patience(self, sensor: str) -> int:
         """Rejected measurements in a row after which the state must be wrong."""
         return self.config.resync_after if sensor in ("velocimeter", "gyro") else self.config.reinit_after
@@ -384,6 +409,8 @@ class Estimator:
     def _trust(self) -> tuple[Trust, str]:
         """What the estimate is good for, judged by the sensor that has been silent for too long."""
         worst, why = Trust.GOOD, ""
+        for name in self._unsure:  # a first reading may be a spike
+            worst, why = Trust.HOLD, f"{name}: no second reading that agrees with the first yet"
         for name, hold, lost in self._limits:
             silence = self._watch.silence(name, self._stamp)
             if silence < hold:

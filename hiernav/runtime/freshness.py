@@ -36,7 +36,8 @@ class SensorWatch:
     """Remembers when each sensor last said something new that was believed.
 
     Noise makes a sensor differ from one reading to the next. One that has done so, then repeats itself to the bit
-    under fresh stamps while others go on changing, is frozen. A reading of nothing but zeros is what wheel encoders
+    under fresh stamps while others go on changing, is frozen; so are all of them if all repeat themselves at once, and
+    none ever did before. A reading of nothing but zeros is what wheel encoders
     say at rest; it is frozen only once another sensor has changed as only motion changes it. A sensor that repeats
     itself in health, being coarse or without noise, is not judged: what it says wrong is for the gates to find.
     """
@@ -72,7 +73,7 @@ class SensorWatch:
         if value == sensor.value:
             sensor.repeats += 1
             return
-        if sensor.repeats >= REPEATS and (sensor.changes < LEARN or not self._others_moved(name, sensor.new, STIR)):
+        if sensor.repeats >= REPEATS and not self._hung(name, sensor):
             sensor.repeats_itself = True
         sensor.changes += 1
         sensor.repeats = 0
@@ -102,7 +103,25 @@ class SensorWatch:
         sensor = self._sensors[name]
         if sensor.repeats < REPEATS or sensor.changes < LEARN or sensor.repeats_itself:
             return False
-        return self._others_moved(name, sensor.new, STIR if any(sensor.value) else LEAP)
+        if self._others_moved(name, sensor.new, STIR if any(sensor.value) else LEAP):
+            return True
+        return any(sensor.value) and self._all_repeat(sensor.new)
+
+    def _hung(self, name: str, sensor: _Sensor) -> bool:
+        """Whether a sensor that repeated itself and now does not any more should not have."""
+        if sensor.changes < LEARN:
+            return False
+        return self._others_moved(name, sensor.new, STIR) or self._all_repeat(sensor.new)
+
+    def _all_repeat(self, since: float) -> bool:
+        """Whether nothing has been new since then, and that of several sensors which never repeated themselves before:
+        whatever reads them hangs, and shows under fresh stamps what it read last."""
+        repeating = [s for s in self._sensors.values() if s.repeats >= REPEATS and s.changes >= LEARN]
+        return (
+            sum(not sensor.repeats_itself for sensor in repeating) > 1
+            and not any(sensor.repeats_itself for sensor in repeating)
+            and all(sensor.new <= since for sensor in self._sensors.values())
+        )
 
     def _others_moved(self, name: str, since: float, size: float) -> bool:
         for other, sensor in self._sensors.items():

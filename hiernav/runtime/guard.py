@@ -59,11 +59,13 @@ class Guarded:
     """What may be sent to the robot."""
 
     action: np.ndarray
-    """(A,) float64, finite and within the limits; zeros are the brake."""
+    """(A,) float64, finite and within the limits."""
     fault: str | None = None
     """Why the run must end, or None."""
     scale: float = 1.0
     """Factor by which the robot was slowed down."""
+    brake: bool = False
+    """Whether the robot is to be braked instead: `action` is zeros, which need not be its brake."""
 
 
 class Guard:
@@ -123,10 +125,11 @@ class Guard:
         """
         fault = self._tilt_fault(upright)
         if self._tilted:  # lying down it must not move, whether that is a fault yet or not
-            return Guarded(self._brake(), fault)
+            return Guarded(self._brake(), fault, brake=True)
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self.action_dim,):
-            return Guarded(self._brake(), f"action has shape {action.shape}, the robot takes ({self.action_dim},)")
+            fault = f"action has shape {action.shape}, the robot takes ({self.action_dim},)"
+            return Guarded(self._brake(), fault, brake=True)
         if not np.isfinite(action).all():
             return self._refuse(action)
         self._non_finite = 0
@@ -177,7 +180,7 @@ class Guard:
         if self._non_finite >= self.config.max_non_finite:
             channel = int(np.flatnonzero(~np.isfinite(action))[0])
             fault = f"action not finite {self._non_finite} times in a row, first in channel {channel}"
-        return Guarded(self._brake(), fault)
+        return Guarded(self._brake(), fault, brake=True)
 
     def _tilt_fault(self, upright: float | None) -> str | None:
         if self.config.tilt_limit is None or upright is None or upright >= self._least_upright:

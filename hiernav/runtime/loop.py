@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import signal
 import threading
@@ -14,8 +15,12 @@ from hiernav.runtime.clock import Clock
 from hiernav.runtime.timing import Histogram
 
 BRAKE_ATTEMPTS = 3
+SPOILT = 10
+"""Deadlines in a row that preparing for them has made late, after which it is dropped."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks for an end. A SIGHUP that is ignored, as under nohup, asks for none."""
+
+log = logging.getLogger(__name__)
 
 
 class LoopExit(Enum):
@@ -79,6 +84,7 @@ class FixedRateLoop:
         self._brake = brake
         self._handle_signals = handle_signals
         self._prepare, self._lead, self._ahead, self._again = prepare, lead, lead, 0.5 * lead
+        self._spoilt = 0
         self._leaving = True
         self._signalled = False
         self._stopped = False
@@ -143,6 +149,10 @@ class FixedRateLoop:
         began = self.clock.now()
         self._prepare(False)
         first = self.clock.now()
+        self._spoilt = self._spoilt + 1 if first > deadline else 0
+        if self._spoilt >= SPOILT:
+            log.warning("preparing takes %.1f ms, which makes ticks late: dropped", 1e3 * (first - began))
+            self.drop_preparation()
         again = max(0.95 * self._again, 0.5 * (first - began))  # the first has warmed the caches for it
         if self._prepare is not None and first + again <= deadline:
             self._prepare(True)

@@ -134,6 +134,11 @@ class Pilot:
         self.reset()
 
     @property
+    def control_period(self) -> float | None:
+        """Time between two calls of `act` that the policies are for [s]; None if any will do."""
+        return self.agent.control_period
+
+    @property
     def rejected(self) -> int:
         """Plans that were not finite or left the map."""
         return self._sound.rejected

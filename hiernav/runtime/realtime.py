@@ -39,6 +39,12 @@ class RealtimeConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.rehearsal < math.inf:
             raise ValueError(f"RealtimeConfig.rehearsal = {self.rehearsal} s must be finite and not negative")
+        if self.timer_slack_ns < 0:
+            raise ValueError(f"RealtimeConfig.timer_slack_ns = {self.timer_slack_ns} ns must not be negative")
+        if self.fifo_priority is not None and not 1 <= self.fifo_priority <= 99:
+            raise ValueError(f"RealtimeConfig.fifo_priority = {self.fifo_priority} must be 1 to 99, or null")
+        if self.cpus is not None and (not self.cpus or min(self.cpus) < 0):
+            raise ValueError(f"RealtimeConfig.cpus = {list(self.cpus)} must be numbers of CPUs from 0, at least one")
 
 
 def realtime_of(values: Mapping[str, Any]) -> RealtimeConfig:

@@ -15,7 +15,7 @@ from hiernav.config import RewardConfig
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import OptionStep, WaypointOption, guided
+from hiernav.nav.option import OptionStep, WaypointOption, observe
 from hiernav.nav.recovery import Recovery
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, inside
@@ -178,15 +178,12 @@ class NavigationTask:
         maps = self._maps if rows is None else [self._maps[row] for row in rows]
         pick = slice(None) if rows is None else rows  # of all rows no copy is made
         pose, goal = self.sim.pose[pick], self.goal[pick]
-        option = self.option.step(pose[:, :2], goal, maps, rows, self.sim.time[pick])
-        plan = option.plan
-        if self.recovery is not None:
-            plan = self.recovery(pose, plan, maps, rows)
-            self.option.waiting |= self.recovery.ended
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
         sensors["lidar"] = lidar_closeness(pose, self._discs[pick])
-        seen = sensors if self.recovery is None else self.recovery.dim(sensors, rows)
-        built = self.layout.build(guided(seen, pose, plan, goal, self.steps[pick] * self.robot.control_period))
+        time = self.steps[pick] * self.robot.control_period
+        option, _, built = observe(
+            self.option, self.recovery, self.layout, pose, sensors, goal, maps, time, self.sim.time[pick], rows
+        )
         if not np.isfinite(built).all():
             built = np.nan_to_num(built)  # a broken row is reported, not passed on
         if rows is None:

@@ -65,7 +65,7 @@ class LocalBatches:
             self._env,
             self.policy,
             frames_per_batch=per_batch,
-            total_frames=max(1, frames // per_batch) * per_batch,
+            total_frames=whole_batches(frames, per_batch) * per_batch,
             init_random_frames=random_batches(self.config, steps, per_batch) * per_batch,
             auto_register_policy_transforms=False,
         )
@@ -93,10 +93,19 @@ def frames_of_batch(num_envs: int, frames: int) -> int:
     return num_envs * max(1, min(_BATCH_FRAMES, frames) // num_envs)
 
 
+def whole_batches(frames: int, per_batch: int) -> int:
+    """Batches of a segment of at least so many frames: it ends past the evaluation that is due, not just before."""
+    return -(-frames // per_batch)
+
+
 def segment_frames(skill: SkillConfig, steps: int) -> int:
-    """Steps wanted of the segment that begins after so many, summed over the simulations of all workers."""
-    rows = skill.num_envs * (1 if skill.collector == "local" else skill.workers)
-    return min(max(skill.checkpoint_every_steps, _SEGMENT_STEPS * rows), skill.total_steps - steps)
+    """Steps wanted of the segment that begins after so many, summed over the simulations of all workers.
+
+    The last one takes with it what would be too little for another.
+    """
+    least = _SEGMENT_STEPS * skill.num_envs * (1 if skill.collector == "local" else skill.workers)
+    frames, left = max(skill.checkpoint_every_steps, least), skill.total_steps - steps
+    return left if left < frames + least else frames
 
 
 def random_batches(config: TrainConfig, steps: int, frames: int) -> int:

@@ -21,7 +21,7 @@ from torchrl.modules import ProbabilisticActor
 from hiernav.config import TrainConfig
 from hiernav.nav.option import Planner
 from hiernav.run import WorkersLost
-from hiernav.skill.collect import frames_of_batch, random_batches, segment_frames
+from hiernav.skill.collect import frames_of_batch, random_batches, segment_frames, whole_batches
 from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.machines import Machines, Weights, find_machines
 
@@ -48,7 +48,7 @@ class WorkerBatches:
         if self._machines is None:
             self._machines = find_machines(self.config, self.share, self.planner)
             self.workers = [Worker(k, self.config, self._machines) for k in range(self.config.skill.workers)]
-        begun, last = steps, steps + max(1, frames // self.frames) * self.frames
+        begun, last = steps, steps + whole_batches(frames, self.frames) * self.frames
         self._order(begun, steps)
         while steps < last:
             data = torch.cat([share.result() for share in self._pending])

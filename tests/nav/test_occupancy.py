@@ -186,6 +186,24 @@ def test_visits_are_found_within_a_square_around_a_position() -> None:
     assert not visits.near((-3.0, -3.0), 0.5)
 
 
+def test_visits_stay_where_they_were_when_the_map_grows_or_moves() -> None:
+    visits = VisitMap(empty_map((1.0, 1.0)))
+    visits.add([(0.525, 0.025), (0.325, 0.025), (0.525, 0.025), (-0.925, -0.525)])
+    grown = OccupancyMap(np.zeros((60, 80), dtype=np.bool_), 0.05, (-1.0, -1.5))
+    assert not visits.lies_on(grown)
+    moved = visits.moved_to(grown)
+    assert moved.lies_on(grown) and moved.counts.sum() == visits.counts.sum() == 4
+    assert moved.counts[30, 30] == 2 and moved.counts[30, 26] == 1 and moved.counts[19, 1] == 1
+    moved.add((-0.93, -0.53))
+    assert moved.counts[19, 1] == 1, "resting where the last position was"
+    moved.add((0.525, 0.025))
+    assert moved.counts[30, 30] == 3
+    rolled = visits.moved_to(OccupancyMap(np.zeros((40, 40), dtype=np.bool_), 0.05, (-0.5, -1.0)))
+    assert rolled.counts.sum() == 3 and rolled.counts[20, 20] == 2, "what lies outside is lost"
+    coarse = visits.moved_to(OccupancyMap(np.zeros((20, 20), dtype=np.bool_), 0.1, (-1.0, -1.0)))
+    assert coarse.counts[10, 15] == 2 and coarse.counts[4, 0] == 1
+
+
 def test_clearances_are_the_same_to_the_bit_whenever_they_are_computed() -> None:
     occupied = np.random.default_rng(0).random((60, 50)) < 0.01
     row, col = np.indices(occupied.shape)

@@ -105,6 +105,21 @@ def test_after_a_reset_a_plan_is_made_anew_and_counts_and_visits_are_gone() -> N
     assert np.isnan(drive.planner.queries[-1].previous).all()
 
 
+def test_visits_move_with_a_map_that_grows_or_rolls_along() -> None:
+    drive = Drive()
+    drive.at((0.02, 0.02))
+    drive.at((0.22, 0.02))
+    rows, cols = FREE.occupied.shape
+    x, y = FREE.origin
+    drive.map = OccupancyMap(np.zeros((rows + 7, cols + 4), dtype=np.bool_), FREE.resolution, (x - 0.15, y - 0.2))
+    drive.at((0.22, 0.02))
+    visits = drive.option.visits[0]
+    assert visits is not None and visits.lies_on(drive.map)
+    assert visits.counts.sum() == 2, "resting where it was adds nothing"
+    for place in ((0.02, 0.02), (0.22, 0.02)):
+        assert visits.counts[drive.map.pixel_of(place)] == 1
+
+
 def test_after_a_change_of_goal_the_plan_is_dropped_and_the_episode_kept() -> None:
     drive = Drive(num_rows=2)
     drive.at((0.0, 0.0), (0.0, 1.0))

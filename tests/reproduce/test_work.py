@@ -74,7 +74,7 @@ def test_a_fixed_period_is_what_lies_between_plans():
 @pytest.mark.train
 def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys):
     places = replace(places, runs=places.runs / "#1 [x]: y")  # YAML would read it otherwise
-    size = replace(SMOKE, training=(*SMOKE.training, "skill.num_envs=1", "skill.total_steps=384"))
+    size = replace(SMOKE, training=(*SMOKE.training, "skill.num_envs=1", "skill.total_steps=640"))
     cell = next(c for c in catalogue(ROOT, size, 1, ["point"]) if c.id == "sample_efficiency/point-ours-0")
 
     def stop(share: float, what: str) -> None:
@@ -85,14 +85,14 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
         run_cell(cell, places, stop, ("abc", False))
     capsys.readouterr()
     outcome = run_cell(cell, places, lambda *_: None, ("def", True))
-    assert "going on after step 128 of 384" in capsys.readouterr().out
-    assert [point["step"] for point in outcome.curves["evaluation"]] == [128, 256, 384]
+    assert "going on after step 256 of 640" in capsys.readouterr().out
+    assert [point["step"] for point in outcome.curves["evaluation"]] == [256, 512, 640]
     assert outcome.source["commits"] == ["abc", "def with changes"], "what the queue says that they ran"
     first, *_, last = [json.loads(line)["seconds"] for line in (places.runs / cell.run / "rates.jsonl").open()]
     assert 0.0 < first < last <= trained_seconds(cell, places)
     assert outcome.settings["skill.device"] in ("cpu", "cuda")
     assert outcome.settings["skill.precision"] in ("float32", "bfloat16")
-    assert outcome.settings["skill.total_steps"] == 384 and "run_dir" not in outcome.settings
+    assert outcome.settings["skill.total_steps"] == 640 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
 
 

@@ -40,8 +40,8 @@ def test_an_episode_can_time_out_before_its_segment_ends(robot: str) -> None:
         *[(robot, [], 20_000) for robot in ("point", "car", "doggo", "baseline-point")],
         ("doggo", ["skill.workers=32"], 20_000),  # whom nobody asks
         ("doggo", ["skill.collector=multi", "skill.workers=32"], 150 * 32 * 32),
-        ("point", ["skill.num_envs=512"], 150 * 512),
-        ("point", ["skill.num_envs=512", "skill.checkpoint_every_steps=90_000"], 90_000),
+        ("point", ["skill.num_envs=512", "skill.total_steps=200_000"], 150 * 512),
+        ("point", ["skill.num_envs=512", "skill.total_steps=200_000", "skill.checkpoint_every_steps=90_000"], 90_000),
     ],
 )
 def test_a_segment_leaves_every_simulation_the_steps_of_an_episode(
@@ -50,6 +50,7 @@ def test_a_segment_leaves_every_simulation_the_steps_of_an_episode(
     skill = load_config(CONFIGS / f"{robot}.yaml", settings).skill
     assert segment_frames(skill, 0) == frames
     assert segment_frames(skill, skill.total_steps - 32) == 32
+    assert segment_frames(skill, skill.total_steps - frames - 32) == frames + 32, "no segment of a step or two"
 
 
 def test_every_segment_and_every_worker_has_episodes_of_its_own() -> None:
