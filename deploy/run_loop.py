@@ -15,8 +15,8 @@ write the summary.
 
 Settings (--set guard.slow_ttc=0.5, or a YAML file with sections) are those of driver, estimator, guard, realtime and
 noise.
-Exit codes: 0 done or interrupted; 1 a fault; 2 bad input; 3 a bundle that must not be used; 4 a goal that cannot be
-driven to.
+Exit codes: 0 done or interrupted; 1 a fault (with --serve and --view one that nobody has acknowledged); 2 bad input;
+3 a bundle that must not be used; 4 a goal that cannot be driven to.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -40,9 +41,11 @@ import numpy as np
 from rich.console import Console
 
 from hiernav import __version__
+from hiernav.decode import ConfigError
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import RESOLUTION
+from hiernav.runtime.account import KEPT, Account, Episode, FaultWatch, GoalWatch
 from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
 from hiernav.runtime.control import ControlServer, default_socket, parse_point, tell
 from hiernav.runtime.driver import Driver
@@ -60,7 +63,8 @@ from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import Robot, Truth
 from hiernav.runtime.settings import Settings, load_settings
-from hiernav.runtime.summary import Episode, print_summary, summarise
+from hiernav.runtime.summary import print_summary, summarise
+from hiernav.runtime.supervisor import Mode
 from hiernav.runtime.trip import RunResult
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
@@ -74,6 +78,8 @@ BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
 PICTURED = 20_000
 """Ticks of a drive that its picture shows at most."""
+TILT_LIMIT = 1.31
+"""Of a robot that can fall, where no file sets another one [rad]: 75 degrees."""
 
 
 class GoalError(ValueError):
@@ -118,6 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if arguments.tell is not None:
             return _tell(arguments)
+        if arguments.seed < 0:
+            raise ValueError(f"--seed {arguments.seed}, it must not be negative")
         return _dry_run(arguments) if arguments.dry_run else _run(arguments)
     except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
         _complain("interrupted")
@@ -193,6 +201,7 @@ def _dry_run(arguments: argparse.Namespace) -> int:
     bundle = arguments.bundle or BUNDLES / spec.name
     if arguments.json not in (None, "-"):
         _require_writable(Path(arguments.json), "--json")
+    _layout(parse_world(arguments.world), arguments.seed, spec, _given_goal(arguments), not arguments.adapter)
     with ExitStack() as stack:
         make = lambda: _process_robot(arguments, spec, settings, stack)  # noqa: E731
         found = report(lambda: _open_bundle(bundle, spec), make, settings)
@@ -207,7 +216,11 @@ def _dry_run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
-    """Those of the robot's file beside this one, with what a file that is named says over them."""
+    """Those of the robot's file beside this one, with what a file that is named says over them.
+
+    Raises:
+        ConfigError: they are wrong, or leave a robot that can fall without a limit of its tilt.
+    """
     own = Path(__file__).resolve().parent / f"{spec.name}.yaml"
     paths = [path for path in (own if own.exists() else None, arguments.settings) if path is not None]
     asked = {
@@ -217,8 +230,11 @@ def _settings(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
             "goal_radius": GOAL_RADIUS,
             "max_steps": parse_world(arguments.world).max_steps,
         },
+        "guard": {"tilt_limit": TILT_LIMIT} if spec.free_base else {},
     }
     settings = load_settings(paths, arguments.set, asked)
+    if spec.free_base and settings.guard.tilt_limit is None:
+        raise ConfigError(f"guard.tilt_limit is null: a {spec.name} can fall, which must be a fault; set it in rad")
     return replace(settings, noise=EXACT) if arguments.exact else settings
 
 
@@ -238,13 +254,11 @@ def _process_robot(
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.episodes < 1:
         raise ValueError(f"--episodes is {arguments.episodes}, it must be at least 1")
-    if arguments.seed < 0:
-        raise ValueError(f"--seed {arguments.seed}, it must not be negative")
     view = arguments.view is not None
     if arguments.fast and (arguments.serve or view or arguments.adapter or arguments.planner == "process"):
         raise ValueError("--fast has no real time: it goes with none of --serve, --view, --adapter, --planner process")
     spec, world = get_robot(arguments.robot), parse_world(arguments.world)
-    goal = None if arguments.goal is None else _parse_goal(arguments.goal)
+    goal = _given_goal(arguments)
     settings = _settings(arguments, spec)
     bundle = _open_bundle(arguments.bundle or BUNDLES / spec.name, spec)
     with ExitStack() as stack:
@@ -280,6 +294,7 @@ class Episodes:
         self.arguments, self.layouts, self.remote, self.link = arguments, layouts, remote, link
         self.layout = layouts[0]
         self.interrupted = self.failed = False
+        serves = arguments.serve or arguments.view is not None
         clock: Clock
         robot: Robot
         if remote is not None:
@@ -313,8 +328,18 @@ class Episodes:
         if arguments.json not in (None, "-"):
             self.files.append(Path(arguments.json))
             _require_writable(self.files[1], "--json")
-        self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
-        self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)
+        with ExitStack() as opened:  # a start that fails leaves nothing behind, and spends no recording's name
+            self.server = ControlServer(self.driver, arguments.control or default_socket()) if serves else None
+            if self.server is not None:
+                opened.callback(_hang_up, self.server)
+            self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)
+            if self.page is not None:
+                opened.callback(self.page.close)
+            self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
+            opened.pop_all()
+        self.account = Account(kept=KEPT if serves else None, began=clock.now())
+        self.faults = FaultWatch(self.account)
+        self.goals = GoalWatch(self.driver, self.account, self.layout.seed) if serves else None
         self.granted = {} if arguments.fast else request_realtime(settings.realtime)
         self.console = _screen(arguments)
 
@@ -326,7 +351,7 @@ class Episodes:
         """Ready for goals until interrupted, or until the robot's adapter has ended, which is a fault."""
         return self._account_for(self._serve)
 
-    def _drive(self, episodes: list[Episode], drives: list[Drive]) -> None:
+    def _drive(self, drives: list[Drive]) -> None:
         for layout in self.layouts:
             self.layout = layout
             drives.append(Drive())
@@ -342,33 +367,43 @@ class Episodes:
                     self.driver.supervisor.acknowledge(self.driver.clock.now())
             if self.interrupted:
                 break
-            episodes.append(self._episode(layout, self.driver.run(layout.goal), drives[-1]))
+            self.account.add(self._episode(layout, self.driver.run(layout.goal)))
             if self.driver.interrupted or self.driver.gone or self.driver.supervisor.latched and self.arguments.adapter:
                 break
 
-    def _serve(self, episodes: list[Episode], drives: list[Drive]) -> None:
+    def _serve(self, drives: list[Drive]) -> None:
+        assert self.server is not None and self.goals is not None
         drives.append(Drive())
         self._watch(drives[-1])
         if self.page is not None and not (self.arguments.serve or self.arguments.adapter):
             self.page.first_goal = self.layout.goal
-        path = self.arguments.control or default_socket()
-        with ControlServer(self.driver, path):
-            self._print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {path})")
-            self.driver.serve()
-        if self.driver.last_result is not None:
-            episodes.append(self._episode(self.layout, self.driver.last_result, drives[-1]))
+        try:
+            with self.server:
+                self._print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {self.server.path})")
+                self.driver.serve()
+        finally:
+            self.goals.close()
+        if not (self.goals.stood or self._at_fault()):
+            self.faults.open = self.account.add_fault("the robot was not seen to stand", self.driver.clock.now())
 
-    def _account_for(self, go: Callable[[list[Episode], list[Drive]], None]) -> int:
+    def _account_for(self, go: Callable[[list[Drive]], None]) -> int:
         """Drive, and show and save the account of it, wherever a signal arrives; pictures alone can be spared."""
-        episodes: list[Episode] = []
         drives: list[Drive] = []
         code = OK
         try:
             with noting_signals(self._interrupt):
-                go(episodes, drives)
-                code = self._finish(episodes, drives)
+                try:
+                    go(drives)
+                except Exception as error:  # the loop has braked; what was driven until then is accounted for
+                    self.failed = True
+                    self.account.add_fault(f"{type(error).__name__}: {error}", self.driver.clock.now())
+                    _show(traceback.print_exc, sys.stderr)
+                finally:
+                    for observer in filter(None, (self.recorder, self.page)):
+                        observer.close()
+                code = self._finish(drives)
             if not (self.arguments.no_pictures or self.interrupted):
-                self._draw(episodes, drives)
+                self._draw(drives)
         except KeyboardInterrupt:
             _complain("interrupted, pictures are missing")
         return code
@@ -378,9 +413,10 @@ class Episodes:
         self.driver.quit()
 
     def _watch(self, drive: Drive) -> None:
-        self.driver.audience.observers = [drive, *filter(None, [self.recorder, self.page])]
+        others = (self.goals, self.recorder, self.page)
+        self.driver.audience.observers = [drive, self.faults, *filter(None, others)]
 
-    def _episode(self, layout: Layout, result: RunResult, drive: Drive) -> Episode:
+    def _episode(self, layout: Layout, result: RunResult) -> Episode:
         truth: Truth | None = None
         with suppress(RuntimeError):  # the robot may be gone
             truth = self.driver.truth()
@@ -393,16 +429,22 @@ class Episodes:
         self._print(f"{text}{': ' + result.detail if result.detail else ''}")
         return Episode(layout.seed, result, collisions, distance)
 
-    def _finish(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> int:
+    def _at_fault(self) -> bool:
+        """Whether the run is to end with the exit code of a fault: who serves had those acknowledged that were."""
+        if self.failed or self.driver.gone:
+            return True
+        if self.goals is None:
+            return any(episode.result.fault for episode in self.account.episodes)
+        return self.faults.open is not None or self.driver.supervisor.mode is Mode.FAULT
+
+    def _finish(self, drives: Sequence[Drive]) -> int:
         """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""
         code = OK
-        if not self.arguments.serve and any(episode.result.refused for episode in episodes):
+        if self.goals is None and any(episode.result.refused for episode in self.account.episodes):
             code = BAD_GOAL  # who serves was asked for many goals, and told of each
-        if self.failed or self.driver.gone or any(episode.result.fault for episode in episodes):
+        if self._at_fault():
             code = FAULT
-        for observer in filter(None, (self.recorder, self.page)):
-            observer.close()
-        summary = self._summary(episodes, drives)
+        summary = self._summary(drives)
         _show(lambda: print_summary(summary, self.console), self.console.file)
         if self.recorder is not None:
             self._print(f"recording: {self.recorder}")
@@ -414,22 +456,25 @@ class Episodes:
         return code
 
     def _print(self, text: str) -> None:
-        _show(lambda: self.console.print(text, highlight=False), self.console.file)
+        _show(lambda: self.console.print(text, highlight=False, markup=False), self.console.file)
 
-    def _summary(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> dict[str, Any]:
-        summary = summarise(episodes, self.driver.timer, self.driver.loop, self.granted)
+    def _summary(self, drives: Sequence[Drive]) -> dict[str, Any]:
+        summary = summarise(self.account, self.driver.timer, self.driver.loop, self.granted)
         summary["recording"] = None if self.recorder is None else self.recorder.summary()
-        summary["startup_seconds"] = drives[0].armed_age
+        summary["startup_seconds"] = drives[0].armed_age if drives else None
         if self.remote is not None:
             summary["adapter"] = {"watchdog_trips": self.remote.watchdog_trips, "realtime": dict(self.remote.realtime)}
         if self.link is not None:
             summary["planner"] = {"restarts": self.link.restart_count(), "seconds": self.link.plan_time.summary()}
         return summary
 
-    def _draw(self, episodes: Sequence[Episode], drives: Sequence[Drive]) -> None:
-        for layout, drive, episode in zip(self.layouts, drives, episodes, strict=False):
+    def _draw(self, drives: Sequence[Drive]) -> None:
+        ends = [episode.result.reason for episode in self.account.episodes]
+        if self.goals is not None:  # one drive to all of them
+            ends = [", ".join(f"{reason} {count}" for reason, count in self.account.ends.items())] if ends else []
+        for layout, drive, end in zip(self.layouts, drives, ends, strict=False):
             if drive.path:
-                title = f"{layout.spec}, seed {layout.seed}: {episode.result.reason}"
+                title = f"{layout.spec}, seed {layout.seed}: {end}"
                 file = self.out / f"drive-{layout.seed}.png"
                 partial = file.with_name(file.name + ".part")
                 try:
@@ -440,6 +485,12 @@ class Episodes:
                 finally:
                     with suppress(OSError):
                         partial.unlink()
+
+
+def _hang_up(server: ControlServer) -> None:
+    """Take a socket away again at which nobody has been heard."""
+    with server:
+        pass
 
 
 def _screen(arguments: argparse.Namespace) -> Console:
@@ -569,9 +620,9 @@ def process_age() -> float | None:
         return None
 
 
-def _parse_goal(text: str) -> np.ndarray:
+def _given_goal(arguments: argparse.Namespace) -> np.ndarray | None:
     try:
-        return parse_point(text)
+        return None if arguments.goal is None else parse_point(arguments.goal)
     except ValueError as error:
         raise ValueError(f"--goal {error}") from None
 

@@ -82,7 +82,7 @@ def doggo_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from hiernav.skill.train import make_learner
 
     folder = tmp_path_factory.mktemp("doggo")
-    config = tiny_run.config(folder, "robot=doggo", "planner.preset=paper")
+    config = tiny_run.config(folder, "robot=doggo", "planner.preset=paper", "planner.hypotheses=1")
     torch.manual_seed(0)
     write_bundle(folder, config, make_network("paper", 10, 0.1, 1), make_learner(config).actor, {})
     return folder

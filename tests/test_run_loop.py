@@ -138,20 +138,26 @@ def test_a_goal_of_ones_own_is_driven_to(script, able_bundle, tmp_path, capsys):
     assert "goal after" in capsys.readouterr().out
 
 
+MODES = pytest.mark.parametrize("mode", [[], ["--dry-run"]], ids=["drive", "dry-run"])
+
+
+@MODES
 @pytest.mark.parametrize("goal", ["1", "a,b", "1,2,3", "nan,0", "inf,0", "", "-1;2"])
-def test_a_malformed_goal_is_refused(refused, able_bundle, goal):
-    line = refused(2, "--bundle", able_bundle, "--goal", goal)
+def test_a_malformed_goal_is_refused(refused, able_bundle, goal, mode):
+    line = refused(2, "--bundle", able_bundle, "--goal", goal, *mode)
     assert f"--goal {goal!r}: expected X,Y in metres, for example 1.2,-0.5" in line
 
 
-def test_a_goal_outside_the_field_is_refused_with_its_extent(refused, able_bundle):
-    line = refused(4, "--bundle", able_bundle, "--world", "pillar(2,1.5,2)", "--goal", "-2.5,0")
+@MODES
+def test_a_goal_outside_the_field_is_refused_with_its_extent(refused, able_bundle, mode):
+    line = refused(4, "--bundle", able_bundle, "--world", "pillar(2,1.5,2)", "--goal", "-2.5,0", *mode)
     assert "--goal -2.5,0 lies outside the field: x from -2 to 2, y from -1.5 to 1.5 m" in line
 
 
-def test_a_goal_inside_an_obstacle_is_refused_with_where_to_look(refused, able_bundle):
+@MODES
+def test_a_goal_inside_an_obstacle_is_refused_with_where_to_look(refused, able_bundle, mode):
     x, y = sample_layout(parse_world("pillar(2,2,10)"), 4).pillars[0]
-    line = refused(4, "--bundle", able_bundle, "--seed", 4, "--goal", f"{x:.3f},{y:.3f}")
+    line = refused(4, "--bundle", able_bundle, "--seed", 4, "--goal", f"{x:.3f},{y:.3f}", *mode)
     assert (
         "is less than 0.1 m from an obstacle in seed 4: choose a free place (hiernav world --png draws the world)"
         in line
@@ -295,6 +301,23 @@ def test_a_file_of_settings_takes_nothing_away_from_the_robot_s_own(script, tmp_
     arguments = script._parser().parse_args(["--robot", "doggo", "--settings", str(own)])
     settings = script._settings(arguments, script.get_robot("doggo"))
     assert settings.estimator.gyro_sigma == 0.05 and settings.guard.tilt_limit == 1.31
+
+
+@pytest.mark.parametrize(("robot", "limit"), [("doggo", 1.31), ("car", 1.31), ("point", None)])
+def test_a_robot_that_can_fall_has_a_limit_of_its_tilt_also_where_its_file_is_missing(
+    script, tmp_path, monkeypatch, robot, limit
+):
+    """The script may have been copied alone."""
+    monkeypatch.setattr(script, "__file__", str(tmp_path / "run_loop.py"))
+    asked = ["--robot", robot, "--set", "guard.slew_limit=0.3"]
+    settings = script._settings(script._parser().parse_args(asked), script.get_robot(robot))
+    assert (settings.guard.tilt_limit, settings.guard.slew_limit) == (limit, 0.3)
+
+
+@pytest.mark.parametrize("mode", ["--fast", "--dry-run"])
+def test_a_robot_that_can_fall_is_not_driven_without_a_limit_of_its_tilt(refused, doggo_bundle, mode):
+    line = refused(2, "--robot", "doggo", "--bundle", doggo_bundle, "--set", "guard.tilt_limit=null", mode)
+    assert "guard.tilt_limit is null: a doggo can fall" in line
 
 
 def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path):

@@ -11,13 +11,15 @@ MAX_DEPTH = 32
 _CHILDREN: dict[str, dict[int, str]] = {
     "Model": {7: "Graph", 8: "Opset", 25: "Function"},
     "Graph": {1: "Node", 5: "Tensor", 15: "Sparse"},
-    "Function": {7: "Node", 9: "Opset"},
+    "Function": {7: "Node", 9: "Opset", 11: "Attribute"},
     "Node": {5: "Attribute"},
     "Attribute": {5: "Tensor", 6: "Graph", 10: "Tensor", 11: "Graph", 22: "Sparse", 23: "Sparse"},
     "Sparse": {1: "Tensor", 2: "Tensor"},
     "Tensor": {},
     "Opset": {},
 }
+_TRAINING = 20
+"""Field of a model that is refused: more graphs and weights, which no robot needs."""
 _NODE_OPERATOR, _NODE_DOMAIN = 4, 7
 _OPSET_DOMAIN, _OPSET_VERSION = 1, 2
 _TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
@@ -25,7 +27,7 @@ _STANDARD_DOMAINS = ("", "ai.onnx")
 
 
 class OnnxFileError(ValueError):
-    """Bytes that are no ONNX model."""
+    """Bytes that are no ONNX model, or none that is accepted."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def inspect_onnx(data: bytes) -> OnnxFacts:
     """Walk a serialised model.
 
     Raises:
-        OnnxFileError: `data` is not a serialised ONNX model.
+        OnnxFileError: `data` is not a serialised ONNX model, or is one that is to be trained.
     """
     walk = _Walk()
     walk.message("Model", memoryview(data), 0)
@@ -70,6 +72,8 @@ class _Walk:
         texts: dict[int, str] = {}
         version = 0
         for number, value in _fields(data):
+            if kind == "Model" and number == _TRAINING:
+                raise OnnxFileError("it holds training_info, and nothing is trained here")
             if isinstance(value, int):
                 if kind == "Tensor" and number == _TENSOR_DATA_LOCATION and value != 0:
                     self.external = True

@@ -295,10 +295,11 @@ class WaypointOption:
             self.counts[pick, _NONE] += 1
         replanned = self._adopted[pick].copy()
         self._adopted[pick] = False
-        began = time.perf_counter()
+        seconds = 0.0
         if len(due):
+            began = time.perf_counter()
             replanned[due] |= self._replan(rows[due], position[due], goal[due], [occupancy[k] for k in due.tolist()])
-        seconds = time.perf_counter() - began
+            seconds = time.perf_counter() - began
         return OptionStep(reason, self.plan[pick].copy(), self.start[pick].copy(), replanned, seconds)
 
     def line(self) -> np.ndarray:

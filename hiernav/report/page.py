@@ -122,11 +122,12 @@ def _strict(book: Book) -> str:
 
 def _table2(book: Book) -> str:
     return (
-        "<p>Collisions in an episode of a disc that walks along the waypoints, 1000 episodes in pillar(2,2,10); plans "
-        "are neither verified nor repaired, though of the six that <i>our network</i> proposes at once, one that is free "
-        "on the map is taken if there is any; every waypoint that touches an obstacle counts 1. <i>Its network, ours</i> is the published "
-        "network trained here. Every set is seen at least six times, and small ones until there were 1,000 updates of "
-        "256 samples: the largest set is more data and more updates at once. The paper does not tell its own.</p>"
+        "<p>Collisions in an episode of a disc that walks along the waypoints, 1000 episodes in pillar(2,2,10); every "
+        "waypoint that touches an obstacle counts 1. Plans are neither verified nor repaired, though of the six that "
+        "<i>our network</i> proposes at once, one that is free on the map is taken if there is any. <i>Its network, "
+        "ours</i> is the published network trained here. Every set is seen at least six times, and small ones until "
+        "there were 1,000 updates of 256 samples: the largest set is more data and more updates at once. The paper "
+        "does not tell its own.</p>"
         + _gallery([(figures.table2(book), "collisions of plans against samples")])
         + tables.table2(book)
         + _command(book, "--only table2")
@@ -159,11 +160,12 @@ def _efficiency(book: Book) -> str:
     return (
         "<p>Evaluations of the noiseless policy during training, in the worlds it is trained in. Thin lines are "
         "seeds, thick ones the mean of those that are of the settings of now. The baseline sees the goal in the place "
-        "of waypoints, and its reward is the distance to the goal in the place of the path’s terms and of ours; all else "
-        "is the same. Returns in the curves are by each one’s own reward and not to be compared; those in the table "
-        "are of both by the baseline’s, as in the paper, except that here it has terms that the paper’s lacks: leaving "
-        "the field, tilting and falling cost as well, the latter at every step on the back. Trainings by "
-        "several versions of this library stand side by side: <i>code</i> names them. The paper’s own curves are printed without numbers; its networks of Table III were trained for "
+        "of waypoints, and its reward is the distance to the goal in the place of the path’s terms and of ours; all "
+        "else is the same. Returns in the curves are by each one’s own reward and not to be compared; those in the "
+        "table are of both by the baseline’s, as in the paper, except that here it has terms that the paper’s lacks: "
+        "leaving the field, tilting and falling cost as well, the latter at every step on the back. Trainings by "
+        "several versions of this library stand side by side: <i>code</i> names them. The paper’s own curves are "
+        "printed without numbers; its networks of Table III were trained for "
         f"3,000,000 steps.</p><p>{_RECOVERY}</p>"
         + (f'<p class="short">Failed: {escape(", ".join(failed))}.</p>' if failed else "")
         + _gallery(shown)
@@ -275,8 +277,8 @@ def _provenance(book: Book) -> str:
         "<p>Every number is from a file in <code>results/</code>, with its seed, commit, settings, machine, duration "
         "and the command that makes it.</p>",
         tables.table(["done", "failed", "not run yet", "took"], rows, "experiment"),
-        f"<p>Commits: {_versions(results) or 'none'}. A result is made again when its settings or its bundle change, not "
-        "when the code does: what stands in one table may be of several versions.</p>",
+        f"<p>Commits: {_versions(results) or 'none'}. A result is made again when its settings or its bundle change, "
+        "not when the code does: what stands in one table may be of several versions.</p>",
         "<p>Machines: " + escape("; ".join(machines) or "none") + ".</p>",
         *(f"<p><small>{escape(text)}</small></p>" for text in versions),
     ]

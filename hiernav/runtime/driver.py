@@ -568,6 +568,8 @@ class Driver:
                 ticket.refuse(mode, f"no goal is taken before {mode} is acknowledged: {fault}")
             return
         self._end_trip("changed", now)
+        if self._ended is not None:
+            self.last_result = self._result(self._ended, stopped=False)
         self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
         self._blind.renew(now)
         self._before = (self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts())

@@ -54,6 +54,9 @@ class EstimatorConfig:
     max_gap: float = 1.0
     """Without a frame for this long, nothing of the state is worth keeping; a lone stamp this far ahead is not believed
     [s]."""
+    confirm: bool = True
+    """Whether a first position and a first heading are driven on only once a second reading agrees: either may be a
+    spike."""
     history: float = 0.5
     """Oldest fix that can still be used [s]."""
     max_jump: float = 6.0

@@ -77,7 +77,7 @@ class Estimator:
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
-        self._unsure = {"position_fix": 0, "magnetometer": 0}
+        self._unsure = {"position_fix": 0, "magnetometer": 0} if config.confirm else {}
         """Sensors of which no reading agrees with the first one yet, and how many have not."""
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
@@ -335,7 +335,7 @@ class Estimator:
             self._unsure.pop("position_fix", None)
         else:
             unsure = self._unsure.get("position_fix") is not None
-            if not (unsure or self._reject("position_fix", miss)):
+            if not (first or unsure or self._reject("position_fix", miss)):
                 return
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)

@@ -2,60 +2,50 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from hiernav.runtime.account import Account, Episode
 from hiernav.runtime.loop import FixedRateLoop
 from hiernav.runtime.timing import TickTimer
-from hiernav.runtime.trip import RunResult
 
-
-@dataclass(frozen=True)
-class Episode:
-    """One run, with what only its surroundings know."""
-
-    seed: int | None
-    result: RunResult
-    collisions: int | None = None
-    """Control steps with contact; None where nothing measures it."""
-    true_distance: float | None = None
-    """From the true position to the goal [m]; None where it is not known."""
+SHOWN, SHOWN_FAULTS = 100, 10
+"""Episodes and faults on the screen, the newest."""
 
 
 def summarise(
-    episodes: Sequence[Episode], timer: TickTimer, loop: FixedRateLoop, realtime: Mapping[str, str]
+    episodes: Account | Sequence[Episode], timer: TickTimer, loop: FixedRateLoop, realtime: Mapping[str, str]
 ) -> dict[str, Any]:
     """Everything worth knowing about the runs, in JSON's own types; times in seconds.
 
     Args:
-        episodes: the runs, in order.
+        episodes: the runs, in order, or an account of them.
         timer: of the ticks of all runs.
         loop: that paced them.
         realtime: what the system granted (`request_realtime`).
     """
-    replans: Counter[str] = Counter()
-    plans: Counter[str] = Counter()
-    for episode in episodes:
-        replans.update(episode.result.replans)
-        plans.update(episode.result.planner)
+    account = episodes if isinstance(episodes, Account) else Account(episodes)
     return {
-        "episodes": [_episode(episode) for episode in episodes],
+        "episodes": [_episode(episode) for episode in account.episodes],
+        "ends": dict(account.ends),
+        "faults": {"count": account.fault_count, "newest": [asdict(fault) for fault in account.faults]},
         "timing": {
             "period": loop.period,
-            "rate": timer.rate,
+            "rate": _rate(loop),
             "ticks": loop.ticks,
             "overruns": loop.overruns,
             "lateness": loop.lateness.summary(),
             "tick": timer.tick.summary(),
             "sections": {name: histogram.summary() for name, histogram in timer.sections.items()},
         },
-        "replans": dict(replans),
-        "plans": dict(plans),
+        "replans": dict(account.replans),
+        "plans": dict(account.plans),
+        "guard": dict(account.guard),
         "realtime": dict(realtime),
     }
 
@@ -63,13 +53,23 @@ def summarise(
 def print_summary(summary: Mapping[str, Any], console: Console | None = None) -> None:
     """Show a summary made by `summarise`."""
     console = console or Console()
-    console.print(_episode_table(summary["episodes"]))
+    console.print(_episode_table(summary["episodes"], summary["ends"]))
     console.print(_timing_table(summary["timing"]))
-    for title in ("replans", "plans"):
+    for title in ("ends", "replans", "plans", "guard"):
         counts = ", ".join(f"{name} {count}" for name, count in sorted(summary[title].items())) or "none"
         console.print(f"{title}: {counts}")
+    console.print(f"faults: {summary['faults']['count'] or 'none'}")
+    for fault in summary["faults"]["newest"][-SHOWN_FAULTS:]:
+        after = ", acknowledged" if fault["acknowledged"] else ""
+        console.print(f"  after {fault['seconds']:.1f} s: {fault['why']}{after}", highlight=False, markup=False)
     granted = ", ".join(f"{name} {text}" for name, text in summary["realtime"].items()) or "not asked"
     console.print(f"real time: {granted}", highlight=False)
+
+
+def _rate(loop: FixedRateLoop) -> float:
+    """Ticks per second while the loop ran, by its own clock: what lies between two runs is no driving time."""
+    deadlines = loop.ticks + loop.overruns
+    return loop.ticks / (deadlines * loop.period) if deadlines else 0.0
 
 
 def _episode(episode: Episode) -> dict[str, Any]:
@@ -95,16 +95,17 @@ def _episode(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _episode_table(episodes: Sequence[Mapping[str, Any]]) -> Table:
-    reached = sum(episode["reached"] for episode in episodes)
-    table = Table(title=f"{reached} of {len(episodes)} goals reached", title_justify="left")
+def _episode_table(episodes: Sequence[Mapping[str, Any]], ends: Mapping[str, int]) -> Table:
+    total = sum(ends.values())
+    hidden = f" (the newest {SHOWN} are shown)" if len(episodes) > SHOWN else ""
+    table = Table(title=f"{ends.get('goal', 0)} of {total} goals reached{hidden}", title_justify="left")
     for column in ("seed", "end", "steps", "time [s]", "collisions", "replans", "stopped"):
         table.add_column(column, justify="left" if column in ("end", "stopped") else "right")
-    for episode in episodes:
+    for episode in episodes[-SHOWN:]:
         end = episode["reason"] if episode["fault"] is None else f"{episode['reason']}: {episode['fault']}"
         table.add_row(
             _text(episode["seed"]),
-            end,
+            escape(end),
             str(episode["steps"]),
             f"{episode['seconds']:.1f}",
             _text(episode["collisions"]),

@@ -114,7 +114,10 @@ class TickTimer:
 
     @property
     def rate(self) -> float:
-        """Ticks per second over the last 64 ticks; 0 before the second."""
+        """Ticks per second over the last 64 ticks, for the moment they end: a pause between two runs counts as well.
+
+        0 before the second.
+        """
         if len(self._recent) < 2 or self._recent[-1] <= self._recent[0]:
             return 0.0
         return (len(self._recent) - 1) / (self._recent[-1] - self._recent[0])

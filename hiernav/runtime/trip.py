@@ -45,7 +45,7 @@ class RunResult:
 
     reason: str
     """goal, left_field, timeout, unreachable, goal_outside, goal_occupied, start_outside, start_occupied, cancelled,
-    interrupted, estop or fault."""
+    changed (another goal came), interrupted, estop or fault."""
     steps: int
     """Control steps driven."""
     seconds: float

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import http
 import os
 import re
 import select
 import socket
 import sys
 import threading
-from functools import partial
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import msgspec
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request
 
 from hiernav.runtime import messages
 from hiernav.runtime.observe import TickRecord
 from hiernav.view.commands import MAX_BYTES, Asker, Command, Settings
 
-OWN_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost):\d+")
+OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d+)?")
 
 
 def main(descriptor: int) -> None:
@@ -65,10 +68,30 @@ def _fail(ask: Asker, error: BaseException | None) -> NoReturn:
     os._exit(1)
 
 
+def is_own(headers: Headers) -> bool:
+    """Whether a request comes from the page itself, or from a program that is no browser.
+
+    A page is asked for under the host and port that its origin names, be it at the end of a tunnel with a port of its
+    own; one of another server on this machine has another port.
+    """
+    origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
+    return not origins or origins == [f"http://{host}" for host in hosts if OWN_HOST.fullmatch(host)]
+
+
 def _refuse_other_sites() -> None:
     """Let no web page from elsewhere, open in the same browser, talk to this server."""
     server = websockets.asyncio.server
-    setattr(server, "serve", partial(server.serve, origins=[OWN_ORIGIN, None]))  # noqa: B010  # it is typed as a class
+    serve = server.serve
+
+    def guarded(*arguments: Any, process_request: Any = None, **settings: Any) -> Any:
+        def process(connection: ServerConnection, request: Request) -> Any:
+            if not is_own(request.headers):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "this is for the page's own requests\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **settings)
+
+    setattr(server, "serve", guarded)  # noqa: B010  # it is typed as a class
 
 
 if __name__ == "__main__":

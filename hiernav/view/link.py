@@ -90,7 +90,9 @@ class ViewerLink(Observer):
         """(2,) goal to set at the first tick [m]."""
         self._encoder = messages.TickEncoder()
         self._shown_at = -math.inf
-        self._coarse: tuple[OccupancyMap, OccupancyMap | None] | None = None
+        self._large: OccupancyMap | None = None
+        self._coarse: OccupancyMap | None = None
+        self._coarsening = False
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket: socket.socket | None = ours
         with theirs:
@@ -212,6 +214,8 @@ class ViewerLink(Observer):
                 self.faults[command.text]()
             case "cancel" | "pause" | "resume" | "acknowledge":
                 getattr(self.control, command.kind)()
+            case _:
+                self.refused += 1
 
     def _forget(self) -> None:
         log.warning("the live page is gone; the robot drives on")
@@ -220,14 +224,17 @@ class ViewerLink(Observer):
             self._socket = None
 
     def _with_coarse_map(self, record: TickRecord, occupancy: OccupancyMap) -> TickRecord:
-        """A large map is made coarser in a thread, once; until that is done none is shown."""
-        if self._coarse is None or self._coarse[0] is not occupancy:
-            self._coarse = (occupancy, None)
+        """Large maps are made coarser in a thread, one at a time; the newest that is done is shown, at first none."""
+        if occupancy is not self._large and not self._coarsening:
+            self._large, self._coarsening = occupancy, True
             threading.Thread(target=self._make_coarse, args=(occupancy,), name="coarse map", daemon=True).start()
-        return replace(record, occupancy=self._coarse[1])
+        return replace(record, occupancy=self._coarse)
 
     def _make_coarse(self, occupancy: OccupancyMap) -> None:
-        self._coarse = (occupancy, coarser(occupancy, LARGEST_MAP))
+        try:
+            self._coarse = coarser(occupancy, LARGEST_MAP)
+        finally:
+            self._coarsening = False
 
 
 def coarser(occupancy: OccupancyMap, most: int) -> OccupancyMap:

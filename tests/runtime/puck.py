@@ -92,6 +92,7 @@ class Scripted:
     restarts: int = 0
     plan_counts: Mapping[str, int] = field(default_factory=dict)
     recoveries: int = 0
+    control_period: float | None = None
 
     def reset(self) -> None:
         self.steps = 0
@@ -131,7 +132,7 @@ class Scripted:
         decision = Decision(
             action=action, observation=np.zeros(3, np.float32), reason=reason, plan=np.zeros((10, 2)),
             start=np.zeros(2), plan_stamp=self.plan_stamp, has_plan=True, replanned=replanned, overdue=0.0,
-            refused=False, recovering=False, given_up=False, plan_seconds=0.001,
+            refused=False, recovering=False, given_up=False, plan_seconds=0.001 if replanned else 0.0,
         )  # fmt: skip
         decision = replace(decision, **self.changes(self.steps))  # type: ignore[arg-type]
         self.steps += 1
@@ -146,7 +147,7 @@ def driver_of(
     **settings: object,
 ) -> Driver:
     field_map = empty_map((2.0, 2.0))
-    settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False)))
+    settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False, confirm=False)))
     known = occupancy or (lambda stamp: field_map)
     return Driver(robot or Puck(), pilot or Scripted(), known, clock or FakeClock(), **settings)  # type: ignore[arg-type]
 

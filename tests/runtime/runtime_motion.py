@@ -67,7 +67,7 @@ def estimator_for(motion: Motion, **changes: object) -> Estimator:
 
 @dataclass(frozen=True)
 class Errors:
-    """What an estimator got wrong, from its first estimate on: position (T,) [m] and yaw (T,) [rad]."""
+    """What an estimator got wrong, from its first confirmed estimate on: position (T,) [m] and yaw (T,) [rad]."""
 
     position: np.ndarray
     yaw: np.ndarray
@@ -87,12 +87,16 @@ def follow(
     estimator: Estimator,
     stream: Iterator[SensorFrame],
     damage: Callable[[SensorFrame], SensorFrame] = lambda frame: frame,
+    confirmed: bool = True,
 ) -> Errors:
-    """Feed every frame, after `damage`, and compare with the truth at its stamp."""
+    """Feed every frame, after `damage`, and compare with the truth at its stamp.
+
+    Estimates that rest on a first reading alone are left out, unless `confirmed` is False.
+    """
     position, yaw, estimates = [], [], []
     for k, frame in enumerate(stream):
         estimate = estimator.update(damage(frame))
-        if estimate is not None:
+        if estimate is not None and (estimates or not confirmed or "no second reading" not in estimate.why):
             position.append(float(np.linalg.norm(estimate.pose[:2] - motion.poses[k, :2])))
             yaw.append(wrap(float(estimate.pose[2] - motion.poses[k, 2])))
             estimates.append(estimate)

@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from rich.console import Console
 from run_loop_script import load_script
 from shipped import RUN_LOOP
 
+from hiernav.runtime.account import KEPT, Account, Episode
+from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver
+from hiernav.runtime.loop import FixedRateLoop
+from hiernav.runtime.observe import Observer
 from hiernav.runtime.robot import RobotGone
 from hiernav.runtime.sim_robot import SimRobot
+from hiernav.runtime.summary import print_summary, summarise
+from hiernav.runtime.timing import TickTimer
+from hiernav.runtime.trip import RunResult
+from hiernav.sim.layout import parse_world
+from hiernav.sim.worlds import sample_layout
 
 script = load_script()
 SHORT = ["--fast", "--world", "pillar(2,2,0)", "--set", "driver.max_steps=3"]
 FAULTY = [*SHORT, "--robot", "doggo", "--set", "guard.tilt_limit=0.001"]
+SERVE = [
+    "--serve", "--world", "pillar(2,2,0)", "--planner", "sync", "--control", "socket", "--no-pictures",
+    "--set", "driver.max_steps=3", "--set", "realtime.rehearsal=0",
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -103,13 +121,15 @@ def test_a_signal_just_before_a_world_is_driven_keeps_the_robot_from_moving(run,
 
     def begin_late(driver: Driver) -> None:
         begin(driver)
-        begun.append(driver)
+        begun.append((driver.loop, driver.loop.ticks))
         if len(begun) == 2:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Driver, "_begin", begin_late)
     assert run(*SHORT, "--episodes", "3") == 0
-    assert driven(tmp_path) == ["timeout", "interrupted"] and begun[0].loop.ticks == 4
+    assert driven(tmp_path) == ["timeout", "interrupted"]
+    (loop, _), (_, before) = begun
+    assert loop.ticks == before > 3
 
 
 def test_a_world_that_cannot_be_entered_is_a_fault_and_costs_nothing_of_what_was_driven(
@@ -167,3 +187,212 @@ def test_a_port_that_is_none_is_refused_with_usage(run, capsys, port):
         run(f"--view={port}")
     assert left.value.code == 2
     assert f"argument --view: '{port}' is no port, expected 0 to 65535" in capsys.readouterr().err
+
+
+class Remote(SimRobot):
+    """Looks like a robot in a process of its own, and lives in the test's time."""
+
+    watchdog_trips = 0
+    realtime: dict[str, str] = {}
+
+
+@pytest.fixture
+def serve(run, tmp_path, monkeypatch) -> Callable[..., tuple[int, dict[str, Any]]]:
+    """Serves while `at(driver, tick)` is called in each tick; returns the exit code and the summary."""
+    serve = Driver.serve
+
+    def served(at: Callable[[Driver, int], object], *arguments: str) -> tuple[int, dict[str, Any]]:
+        class Operator(Observer):
+            def __init__(self, driver: Driver) -> None:
+                self.driver, self.ticks = driver, 0
+
+            def make_requests(self) -> None:
+                at(self.driver, self.ticks)
+                self.ticks += 1
+
+        def commanded(driver: Driver) -> None:
+            driver.audience.observers.append(Operator(driver))
+            serve(driver)
+
+        monkeypatch.setattr(Driver, "serve", commanded)
+        code = run(*SERVE, *arguments)
+        return code, json.loads((tmp_path / "out/summary.json").read_text())
+
+    layout = sample_layout(parse_world("pillar(2,2,0)"), 0)
+    monkeypatch.setattr(script, "_process_robot", lambda _, spec, settings, __: Remote(spec, layout, settings.noise))
+    monkeypatch.setattr(script, "MonotonicClock", FakeClock)
+    monkeypatch.setattr(script, "request_realtime", lambda _: {})
+    return served
+
+
+GOAL = sample_layout(parse_world("pillar(2,2,0)"), 0).goal
+
+
+def test_who_serves_accounts_for_every_goal_also_for_those_that_others_overtake(serve, capsys):
+    goals = {10: GOAL, 60: np.array([50.0, 50.0]), 110: GOAL, 112: GOAL}
+
+    def at(driver: Driver, tick: int) -> None:
+        if tick in goals:
+            driver.set_goal(goals[tick])
+        if tick == 160:
+            driver.quit()
+
+    code, summary = serve(at)
+    episodes = summary["episodes"]
+    assert code == 0 and summary["faults"] == {"count": 0, "newest": []}
+    assert [episode["reason"] for episode in episodes] == ["timeout", "goal_outside", "changed", "timeout"]
+    assert [episode["stopped"] for episode in episodes] == [True, True, False, True]
+    assert [episode["steps"] for episode in episodes][::3] == [3, 3]
+    assert summary["ends"] == {"timeout": 2, "goal_outside": 1, "changed": 1}
+    assert all(episode["seed"] == 0 and episode["collisions"] == 0 for episode in episodes)
+    away = np.linalg.norm(sample_layout(parse_world("pillar(2,2,0)"), 0).start[:2] - GOAL)
+    assert episodes[0]["true_distance"] == pytest.approx(away, abs=0.1) and episodes[1]["true_distance"] > 60.0
+    assert summary["replans"]["start"] == sum(episode["replans"].get("start", 0) for episode in episodes)
+    assert "0 of 4 goals reached" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("then", "code"), [("acknowledge", 0), ("estop", 1), ("cancel", 1)])
+def test_a_fault_without_a_goal_is_named_and_ends_with_code_1_unless_it_was_acknowledged(serve, capsys, then, code):
+    def at(driver: Driver, tick: int) -> None:
+        if tick == 10:
+            whole = driver.occupancy
+
+            def broken(_: float) -> object:
+                driver.occupancy = whole
+                raise OSError("no map [/tmp/map]")
+
+            driver.occupancy = broken
+        if tick == 20:
+            getattr(driver, then)()
+        if tick == 40:
+            driver.quit()
+
+    ended, summary = serve(at)
+    faults = summary["faults"]
+    assert (ended, summary["episodes"], faults["count"]) == (code, [], 1)
+    assert faults["newest"][0]["why"] == "OSError: no map [/tmp/map]" and 0.1 < faults["newest"][0]["seconds"] < 0.5
+    assert faults["newest"][0]["acknowledged"] == (code == 0)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "faults: 1 after 0.2 s: OSError: no map [/tmp/map]" in shown
+    assert (", acknowledged" in shown) == (code == 0)
+
+
+def test_the_fault_of_a_goal_is_told_with_it_although_it_was_acknowledged_before_the_robot_stood(serve):
+    def at(driver: Driver, tick: int) -> None:
+        if tick == 10:
+            driver.set_goal(GOAL)
+        if tick == 12:
+
+            def fails(_: np.ndarray) -> None:
+                del driver.robot.send
+                raise OSError("bus error")
+
+            driver.robot.send = fails
+        if tick == 13:
+            driver.acknowledge()
+        if tick == 60:
+            driver.quit()
+
+    code, summary = serve(at)
+    (episode,) = summary["episodes"]
+    assert code == 0 and summary["faults"]["newest"][0]["acknowledged"]
+    assert (episode["reason"], episode["fault"]) == ("fault", "OSError: bus error")
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_robot_that_was_not_seen_to_stand_ends_with_code_1(serve, monkeypatch, seen):
+    if not seen:
+        monkeypatch.setattr(Driver, "_stop", lambda _: False)
+
+    def at(driver: Driver, tick: int) -> None:
+        if tick == 10:
+            driver.set_goal(GOAL)
+        if tick == 12:
+            driver.estop("pressed")
+            driver.quit()
+
+    code, summary = serve(at)
+    (episode,) = summary["episodes"]
+    assert (code, episode["reason"], episode["stopped"]) == (0 if seen else 1, "estop", seen)
+    told = [fault["why"] for fault in summary["faults"]["newest"]]
+    assert told == ([] if seen else ["the robot was not seen to stand"])
+
+
+def test_a_loop_that_listens_already_or_a_page_that_fails_spends_no_recording_s_name(serve, run, tmp_path, monkeypatch):
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(tmp_path / "socket"))
+        other.listen()
+        assert run(*SERVE, "--record", "a.mcap") == 2
+    (tmp_path / "socket").unlink()
+
+    def fails(*_: object) -> None:
+        raise ValueError("the live page does not come up")
+
+    monkeypatch.setattr(script, "_open_page", fails)
+    assert run(*SERVE, "--view", "--record", "a.mcap") == 2
+    assert not (tmp_path / "a.mcap").exists() and not (tmp_path / "socket").exists()
+    (tmp_path / "a.mcap").write_text("of the last run")
+    assert run(*SERVE, "--record", "a.mcap") == 2
+    assert not (tmp_path / "socket").exists()
+
+
+def test_an_error_out_of_the_loop_is_a_fault_and_costs_nothing_of_what_was_driven(run, tmp_path, capsys, monkeypatch):
+    drive, goals = Driver.run, []
+
+    def fails(driver: Driver, goal: np.ndarray) -> RunResult:
+        goals.append(goal)
+        return drive(driver, goal) if len(goals) == 1 else 1 / 0
+
+    monkeypatch.setattr(Driver, "run", fails)
+    assert run(*SHORT, "--episodes", "3", "--no-pictures", "--record", "a.mcap") == script.FAULT
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert [episode["reason"] for episode in summary["episodes"]] == ["timeout"] and len(goals) == 2
+    assert [fault["why"] for fault in summary["faults"]["newest"]] == ["ZeroDivisionError: division by zero"]
+    assert summary["recording"]["ticks"] == summary["timing"]["ticks"]
+    assert (tmp_path / "a.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
+    assert "Traceback" in capsys.readouterr().err
+
+
+def account_of(ends: int, kept: int | None = None) -> Account:
+    account = Account(kept=kept)
+    for k in range(ends):
+        account.add(Episode(k, RunResult("goal" if k else "timeout", 1, 0.1, 0.0, True, guard={"clipped": 2})))
+    return account
+
+
+def summary_of(account: Account, loop: FixedRateLoop | None = None, timer: TickTimer | None = None) -> dict[str, Any]:
+    loop = loop or FixedRateLoop(FakeClock(), 0.1, lambda _: True, lambda: None)
+    return summarise(account, timer or TickTimer(), loop, {})
+
+
+def test_of_many_goals_and_faults_the_newest_are_named_and_all_are_counted():
+    account = account_of(5, kept=3)
+    for k in range(KEPT + 2):
+        account.add_fault(f"fault {k}", float(k))
+    summary = summary_of(account)
+    assert [episode["seed"] for episode in summary["episodes"]] == [2, 3, 4]
+    assert summary["ends"] == {"timeout": 1, "goal": 4} and summary["guard"] == {"clipped": 10}
+    assert summary["faults"]["count"] == KEPT + 2 and len(summary["faults"]["newest"]) == KEPT
+    screen = io.StringIO()
+    print_summary(summary, Console(file=screen, width=120))
+    assert "4 of 5 goals reached" in screen.getvalue() and "guard: clipped 10" in screen.getvalue()
+    assert f"fault {KEPT + 1}" in screen.getvalue() and f"fault {KEPT - 9}" not in screen.getvalue()
+
+
+def test_the_rate_is_that_of_driving_whatever_lies_between_two_runs():
+    clock, left = FakeClock(), iter(range(20))
+    timer = TickTimer(stopwatch=clock.now)
+
+    def tick(_: float) -> bool:
+        timer.begin()
+        index = next(left)
+        clock.advance(0.25 if index == 3 else 0.0)  # two deadlines are missed
+        timer.end()
+        return index % 10 == 9
+
+    loop = FixedRateLoop(clock, 0.1, tick, lambda: None)
+    loop.run()
+    clock.advance(1000.0)
+    loop.run()
+    assert (loop.ticks, loop.overruns) == (20, 2)
+    assert summary_of(account_of(2), loop, timer)["timing"]["rate"] == pytest.approx(20 / 2.2)

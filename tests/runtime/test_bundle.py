@@ -199,6 +199,22 @@ def test_external_weights_are_found_inside_of_branches():
     assert inspect_onnx(data).external_data
 
 
+def test_external_weights_are_found_in_the_defaults_of_a_function_s_attributes():
+    model = onnx.load_from_string(skill_bytes())
+    function = model.functions.add(name="f", domain="")
+    inner = onnx.load_from_string(with_external_weights()).graph.initializer[0]
+    function.attribute_proto.append(helper.make_attribute("weight", inner))
+    assert inspect_onnx(model.SerializeToString()).external_data
+
+
+def test_a_model_that_is_to_be_trained_is_refused(folder):
+    model = onnx.load_from_string(skill_bytes())
+    model.training_info.add().algorithm.name = "sgd"
+    replace_file(folder, b.SKILL, model.SerializeToString())
+    with pytest.raises(b.BundleError, match="skill.onnx: .*training_info"):
+        b.load_bundle(folder)
+
+
 @pytest.mark.parametrize("domain", ["com.microsoft", "evil", "ai.onnx.ml"])
 def test_operators_outside_of_the_standard_are_refused(folder, domain):
     replace_file(folder, b.SKILL, skill_bytes(domain=domain))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from puck import Puck, driver_of
 
 from hiernav.runtime import control
@@ -177,6 +180,49 @@ def test_nonsense_is_answered_with_why_and_changes_nothing(serving, command):
     driver, path = serving
     assert "error" in tell(path, command)
     assert driver.goal is None
+
+
+words = st.sampled_from([word for known in control.COMMANDS for word in known.split()])
+pieces = words | st.sampled_from([" ", ",", "-", "1e999", "nan", "1_0", "\x00", "\n", "\r", "[/]", "\u0661", "\u2028"])
+points = st.builds("goal {},{}".format, st.floats(), st.floats())
+lines = st.one_of(
+    st.binary(max_size=300),
+    st.text(max_size=40).map(lambda text: text.encode() + b"\n"),
+    st.lists(pieces, max_size=8).map(lambda parts: "".join(parts).encode() + b"\n"),
+    (words | points).map(lambda text: text.encode() + b"\n"),
+)
+
+
+@given(said=lines, cut=st.integers(0, 300))
+def test_whatever_a_client_says_is_answered_in_a_line_of_json_and_the_loop_ticks_on(said, cut):
+    modes: list[Mode] = []
+
+    class Commanded(Puck):
+        def read(self) -> SensorFrame:
+            tick = self.log.count("read")
+            if tick == 20:
+                for part in filter(None, (said[:cut], said[cut:])):
+                    theirs.sendall(part)
+                    if client.hear(driver):
+                        break
+                else:
+                    theirs.shutdown(socket.SHUT_WR)
+                    client.hear(driver)
+            if tick == 22:
+                driver.quit()
+            modes.append(driver.supervisor.mode)
+            return super().read()
+
+    driver = driver_of(Commanded(noise=1e-3))
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        client = control._Client(ours)
+        driver.serve()
+        assert client.answered()
+        answer = theirs.recv(65536)
+    assert set(json.loads(answer)) & {"mode", "error"} and answer.endswith(b"\n") and answer.count(b"\n") == 1
+    assert modes[20] is Mode.READY and Mode.FAULT not in modes
+    assert len(modes) >= 23 or client.line.decode().strip() == "quit"
 
 
 def test_a_client_that_floods_or_stalls_is_dropped(serving):

@@ -41,6 +41,13 @@ def test_a_goal_in_the_open_is_reached_and_the_robot_stands_there():
     assert driver.supervisor.mode is Mode.INIT
 
 
+def test_policies_of_another_rate_and_a_guard_of_another_robot_are_refused():
+    with pytest.raises(ValueError, match=r"the policies act every 0.1 s, the robot every 0.02 s"):
+        driver_of(Puck(control_period=0.02), Scripted(control_period=0.1))
+    with pytest.raises(ValueError, match=r"the guard is for 3 actuators, the robot has 2"):
+        driver_of(Puck(), guard=Guard(3))
+
+
 def test_every_tick_reads_before_it_sends_and_the_run_ends_with_the_brake():
     robot = Puck()
     driver_of(robot).run(GOAL)
@@ -85,14 +92,14 @@ def test_three_actions_that_are_not_finite_end_in_a_fault_and_none_is_sent():
     result = driver_of(robot, Scripted(lambda step, straight: straight * (math.nan if step >= 5 else 1.0))).run(GOAL)
     assert result.reason == "fault" and "not finite 3 times in a row" in result.fault
     assert result.guard == {"non_finite": 3}
-    assert result.steps == 7  # the third is braked, not sent
+    assert result.steps == 5  # the others are braked, not sent
     assert np.isfinite(robot.position).all()
 
 
 def test_a_single_bad_action_only_brakes_its_tick():
     result = driver_of(pilot=Scripted(lambda step, straight: straight * (math.nan if step == 5 else 1.0))).run(GOAL)
     assert result.reached
-    assert result.steps == 15
+    assert result.steps == 14 and result.seconds == pytest.approx(1.5)
 
 
 def test_a_keyboard_interrupt_stops_the_robot():

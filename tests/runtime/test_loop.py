@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hiernav.runtime.clock import FakeClock, MonotonicClock
-from hiernav.runtime.loop import FixedRateLoop, LoopExit
+from hiernav.runtime.loop import SPOILT, FixedRateLoop, LoopExit
 
 PERIOD = 0.25
 
@@ -345,3 +345,17 @@ def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_ha
     assert len(prepared) == rounds * 198  # before the first tick and after the long one there was no time
     assert prepared[0] == pytest.approx(PERIOD - lead)
     assert prepared[-rounds] == pytest.approx(199 * PERIOD - min(0.0201, lead), abs=1e-3)
+
+
+def test_a_preparation_that_keeps_making_ticks_late_is_dropped(caplog):
+    clock, prepared, late = FakeClock(), [0], []
+
+    def prepare(again: bool) -> None:
+        prepared[0] += 1
+        clock.advance(0.03)
+
+    loop = FixedRateLoop(clock, PERIOD, lambda now: late.append(loop.late) or len(late) == 50, lambda: None,
+                         prepare=prepare, lead=0.02)  # fmt: skip
+    loop.run()
+    assert prepared[0] == SPOILT and "preparing takes 30.0 ms" in caplog.text
+    assert late[SPOILT] > 0.009 and not any(late[SPOILT + 1 :])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import sys
 import threading
@@ -11,6 +12,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from page_stub import Asked, link_to
 
 from hiernav.nav.occupancy import OccupancyMap
@@ -18,6 +21,7 @@ from hiernav.runtime import messages
 from hiernav.runtime.observe import Event, TickRecord
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
+from hiernav.view import link as link_module
 from hiernav.view.commands import MAX_BYTES, Asker, Command
 from hiernav.view.link import COMMANDS_PER_TICK, HEARD_PER_TICK, ViewerLink, coarser
 
@@ -120,6 +124,42 @@ time.sleep(1000)
         time.sleep(0.001)
     assert {call[0] for call in control.calls} == {"goal"} and len(control.calls) > 20
     assert link.refused > 80
+    link._process.kill()
+    link.close()
+
+
+values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.lists(st.integers())
+kinds = st.sampled_from([*"ready failed goal cancel pause resume estop acknowledge fault".split(), "", "quit", 7])
+asked = st.dictionaries(st.sampled_from(["x", "y", "text", "z"]), values | st.just("flood"), max_size=3)
+said = st.one_of(
+    st.binary(min_size=1, max_size=200),
+    st.builds(lambda kind, rest: json.dumps({"kind": kind, **rest}).encode(), kinds, asked),
+    st.builds(lambda kind, x: json.dumps({"kind": kind, "x": x}).encode(), kinds, st.floats() | st.just(10**400)),
+    st.sampled_from([b"[" * 4000, b'{"kind":' + b"[" * 4000, b'{"z":' + b"[" * 4000, b'{"kind":"goal"' * 99]),
+)
+
+
+def test_whatever_the_page_says_is_done_or_refused_and_the_loop_ticks_on():
+    control, injected = Asked(), []
+    link = link_to("time.sleep(1000)", control, faults={"flood": lambda: injected.append(1)})
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    link._socket.close()
+    link._socket = ours
+
+    @example([b'{"kind":"fault","text":"flood"}', b'{"kind":"ready"}', b'{"kind":"estop"}'])
+    @given(st.lists(said, min_size=1, max_size=2 * COMMANDS_PER_TICK))
+    def says(messages: list[bytes]) -> None:
+        before = len(control.calls) + len(injected) + link.refused
+        for message in messages:
+            theirs.send(message)
+        link.make_requests()
+        assert len(control.calls) + len(injected) + link.refused - before == len(messages)
+        assert link._socket is ours
+
+    with theirs:
+        says()
+        assert control.calls and injected and link.refused
     link._process.kill()
     link.close()
 
@@ -248,9 +288,41 @@ def test_a_large_map_is_made_coarser_and_loses_no_obstacle():
     link = link_to("time.sleep(1000)")
     link.tick(record(0, occupancy=large))
     deadline = time.monotonic() + 30.0
-    while link._coarse is None or link._coarse[1] is None:
+    while link._coarse is None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert link._with_coarse_map(record(1), large).occupancy.occupied.size < 1_100_000
+    link._process.kill()
+    link.close()
+
+
+def test_of_a_large_map_that_changes_the_newest_that_is_done_is_shown_and_one_thread_is_at_work(monkeypatch):
+    done, begun = threading.Semaphore(0), []
+
+    def slow(occupancy: OccupancyMap, most: int) -> OccupancyMap:
+        begun.append(occupancy)
+        assert done.acquire(timeout=30.0)
+        return coarser(occupancy, most)
+
+    monkeypatch.setattr(link_module, "coarser", slow)
+    link = link_to("time.sleep(1000)")
+    maps = []
+    for k in range(6):
+        pixels = np.zeros((1100, 1000), dtype=bool)
+        pixels[100 * k] = True
+        maps.append(OccupancyMap(pixels))
+
+    def shown(k: int) -> OccupancyMap | None:
+        return link._with_coarse_map(record(k), maps[k]).occupancy
+
+    assert [shown(k) for k in range(3)] == [None] * 3
+    done.release()
+    until(lambda: link._coarse is not None and not link._coarsening)
+    first = shown(3)
+    assert first is shown(4) is shown(5) and first.occupied[0].all()
+    until(lambda: begun == [maps[0], maps[3]])
+    done.release()
+    until(lambda: shown(3) is not first)
+    assert shown(3).occupied[150].all() and begun == [maps[0], maps[3]]
     link._process.kill()
     link.close()

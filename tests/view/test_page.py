@@ -68,7 +68,7 @@ def robot(tmp_path):
     yield line.split()[-1]
     process.send_signal(signal.SIGINT)
     assert process.wait(WAIT) == 0
-    episode = json.loads((tmp_path / "out" / "summary.json").read_text())["episodes"][0]
+    episode = json.loads((tmp_path / "out" / "summary.json").read_text())["episodes"][-1]
     assert episode["stopped"]
 
 
@@ -190,12 +190,37 @@ def test_the_page_is_for_this_machine_and_for_its_own_site_only(tmp_path):
         assert b"<html" in urllib.request.urlopen(link.url, timeout=60).read(2000).lower()
         version = client.Subprotocol(f"viser-v{__import__('viser').__version__}")
         address = f"ws://127.0.0.1:{port}"
-        with pytest.raises(InvalidHandshake):
-            client.connect(address, origin="http://elsewhere.example", subprotocols=[version])
-        with client.connect(address, origin=link.url, subprotocols=[version]) as connection:
-            assert connection.recv(timeout=60)
+        for elsewhere in ("http://elsewhere.example", f"http://127.0.0.1:{port - 1}", f"http://localhost:{port}"):
+            with pytest.raises(InvalidHandshake):
+                client.connect(address, origin=elsewhere, subprotocols=[version])
+        for own in (link.url, None):
+            with client.connect(address, origin=own, subprotocols=[version]) as connection:
+                assert connection.recv(timeout=60)
     finally:
         link.close()
+
+
+@needs_viser
+@pytest.mark.parametrize(
+    ("host", "origins", "own"),
+    [
+        ("127.0.0.1:8080", ["http://127.0.0.1:8080"], True),
+        ("localhost:9000", ["http://localhost:9000"], True),  # a tunnel with a port of its own
+        ("127.0.0.1:8080", [], True),  # no browser
+        ("127.0.0.1:8080", ["http://127.0.0.1:3000"], False),
+        ("127.0.0.1:8080", ["http://localhost:3000"], False),
+        ("127.0.0.1:8080", ["http://elsewhere.example:8080"], False),
+        ("elsewhere.example:8080", ["http://elsewhere.example:8080"], False),  # its name leads here
+        ("127.0.0.1:8080", ["null"], False),
+        ("127.0.0.1:8080", ["http://127.0.0.1:8080", "http://127.0.0.1:3000"], False),
+    ],
+)
+def test_a_request_is_the_page_s_own_if_its_origin_has_the_host_and_the_port_that_are_asked(host, origins, own):
+    from websockets.datastructures import Headers
+
+    from hiernav.view.__main__ import is_own
+
+    assert is_own(Headers([("Host", host), *(("Origin", origin) for origin in origins)])) == own
 
 
 def test_what_is_said_over_the_socket_is_small():

@@ -41,6 +41,39 @@ def test_a_frozen_sensor_asks_to_hold_within_half_a_second(robot, sensor):
     assert errors.estimates[-1].trust is Trust.LOST
 
 
+def freeze_all(begin: float = BEGIN, end: float = 99.0):
+    """Whatever reads the sensors hangs, and shows what it read last under fresh stamps."""
+    damages = [freeze(sensor, begin, end) for sensor in (*VECTOR_SENSORS, "position_fix")]
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        for each in damages:
+            frame = each(frame)
+        return frame
+
+    return damage
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_sensors_that_all_freeze_at_once_are_not_driven_on_either(robot):
+    motion = recorded(robot)
+    errors = follow(motion, estimator_for(motion), frames(motion), freeze_all())
+    held = next(each for each in errors.estimates if each.stamp > 1.0 and each.trust is not Trust.GOOD)
+    assert BEGIN < held.stamp <= BEGIN + 0.5 and "says nothing usable" in held.why
+    assert errors.estimates[-1].trust is Trust.LOST
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_sensors_that_froze_together_are_watched_again_once_they_have_thawed(robot):
+    motion = recorded(robot)
+    twice = [freeze_all(BEGIN, BEGIN + 0.5), freeze_all(BEGIN + 1.0)]
+    errors = follow(
+        motion, estimator_for(motion), frames(motion), lambda frame: twice[frame.stamp >= BEGIN + 0.8](frame)
+    )
+    assert any(each.trust is Trust.HOLD for each in errors.estimates if BEGIN < each.stamp < BEGIN + 0.5)
+    assert all(each.trust is Trust.GOOD for each in errors.estimates if BEGIN + 0.7 < each.stamp < BEGIN + 1.0)
+    assert any(each.trust is not Trust.GOOD for each in errors.estimates if BEGIN + 1.0 < each.stamp < BEGIN + 1.5)
+
+
 def test_a_sensor_that_thaws_is_trusted_again():
     motion = recorded("car")
     errors = follow(motion, estimator_for(motion), frames(motion), freeze("gyro", end=BEGIN + 0.5))

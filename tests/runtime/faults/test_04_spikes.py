@@ -39,6 +39,35 @@ def test_spikes_are_gated_and_the_position_error_at_most_doubles(robot, seed):
     assert all(estimate.trust is Trust.GOOD for estimate in spiked.estimates)
 
 
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("sensor", ["position_fix", "magnetometer"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_spike_among_the_first_readings_is_not_driven_on(robot, sensor, which):
+    """Before there is a state, nothing tells a spike from the truth but the reading that comes next."""
+    motion, seen = recorded(robot), [0]
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # as strong as the world's field
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        reading = getattr(frame, sensor)
+        if reading is None:
+            return frame
+        seen[0] += 1
+        spike = turned @ reading if sensor == "magnetometer" else reading + [3.0, -0.3]
+        return replace(frame, **{sensor: spike}) if seen[0] == which + 1 else frame
+
+    errors = follow(motion, estimator_for(motion), frames(motion), damage, confirmed=False)
+    good = np.array([each.trust is Trust.GOOD for each in errors.estimates])
+    assert good.mean() > 0.75 and not good[0] and good[-1]
+    assert errors.position[good].max() < 0.15 and np.abs(errors.yaw[good]).max() < 0.3
+
+
+def test_sensors_that_are_noisier_than_was_said_are_believed_after_all():
+    motion = recorded("point")
+    estimator = estimator_for(motion, fix_sigma=1e-4)
+    errors = follow(motion, estimator, frames(motion))
+    assert any(each.trust is Trust.GOOD for each in errors.estimates if each.stamp < 1.5)
+
+
 LIES = {
     "gyro": lambda reading, rng: reading + [0.0, 0.0, 300.0],
     "gyro, scattered": lambda reading, rng: rng.uniform(-90.0, 90.0, 3),

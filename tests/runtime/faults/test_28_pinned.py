@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from puck import Listener, Puck, driver_of, pilot_for
+from puck import Listener, Puck, Scripted, driver_of, pilot_for
 
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.planners import StraightPlanner
 from hiernav.nav.recovery import Recovery
+from hiernav.runtime.driver import DriverConfig
 from hiernav.runtime.supervisor import Mode
 
 PERIOD, GOAL = 0.02, np.array([1.5, 0.0])
@@ -75,3 +76,11 @@ def test_waiting_is_not_being_stuck():
     driver._step = step
     result = driver.run(GOAL)
     assert result.reached and result.recoveries == 0 and result.holds == {"paused": 1}
+
+
+def test_recoveries_are_limited_wherever_they_are():
+    """One that goes to and fro between two traps never has its third in one place."""
+    pilot = Scripted(lambda step, straight: 0.0 * straight, changes=lambda step: {"recovering": step % 4 > 1})
+    result = driver_of(Puck(noise=1e-3), pilot, config=DriverConfig(max_recoveries=5)).run(GOAL)
+    assert result.reason == "fault" and "stuck: 5 recoveries on the way to this goal" in result.fault
+    assert result.recoveries == 5
