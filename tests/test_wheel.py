@@ -40,7 +40,7 @@ def run(site: Path, *arguments: object) -> str:
 
 
 def test_an_installed_wheel_draws_a_world(site):
-    shown = json.loads(run(site, "-m", "hiernav", "world", "two-room", "--seed", 1, "--json"))
+    shown = json.loads(run(site, "-m", "hiernav", "world", "--kind", "two-room", "--seed", 1, "--json"))
     assert shown["world"].startswith("two-room") and shown["seed"] == 1
 
 

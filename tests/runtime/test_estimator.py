@@ -19,7 +19,7 @@ ROBOTS = ("point", "car", "doggo")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_position_is_better_than_one_fix_and_heading_better_than_two_degrees(robot, seed):
     motion = recorded(robot)
-    errors = follow(motion, estimator_for(motion), frames(motion, seed))
+    errors = follow(motion, estimator_for(motion), frames(motion, seed), confirmed=False)
     assert len(errors.position) == len(motion.stamps)
     assert errors.position_rms < FIX_SIGMA
     assert errors.yaw_rms < math.radians(2.0)
@@ -28,7 +28,7 @@ def test_position_is_better_than_one_fix_and_heading_better_than_two_degrees(rob
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_velocity_is_in_the_world_frame(robot):
     motion = recorded(robot)
-    errors = follow(motion, estimator_for(motion), frames(motion))
+    errors = follow(motion, estimator_for(motion), frames(motion), confirmed=False)
     velocity = np.array([estimate.velocity for estimate in errors.estimates])
     dt = motion.stamps[1]
     between = np.diff(motion.poses[:, :2], axis=0) / dt
@@ -50,7 +50,7 @@ def test_heading_is_right_while_the_body_rolls_and_pitches():
     motion = recorded("doggo")
     assert motion.upright.min() < math.cos(math.radians(40.0))
     flat = follow(motion, Estimator(EstimatorConfig(tilts=False)), frames(motion))
-    compensated = follow(motion, estimator_for(motion), frames(motion))
+    compensated = follow(motion, estimator_for(motion), frames(motion), confirmed=False)
     assert np.abs(compensated.yaw).max() < math.radians(5.0)
     assert np.abs(flat.yaw).max() > 2.0 * np.abs(compensated.yaw).max()
     upright = np.array([estimate.upright for estimate in compensated.estimates])
