@@ -83,13 +83,15 @@ def test_a_sensor_that_thaws_is_trusted_again():
 
 def test_a_frozen_position_fix_is_not_driven_on():
     motion = recorded("point")
-    errors = follow(motion, estimator_for(motion), frames(motion), freeze("position_fix"))
+    estimator = estimator_for(motion)
+    errors = follow(motion, estimator, frames(motion), freeze("position_fix"))
     nominal = follow(motion, estimator_for(motion), frames(motion))
     soon = round(1.0 / motion.stamps[1])
     at = round(BEGIN / motion.stamps[1])
     assert np.abs(errors.position[at : at + soon]).max() < 0.15
     assert nominal.position[at : at + soon].max() < 0.06
     assert any(each.trust is Trust.HOLD and "position_fix" in each.why for each in errors.estimates)
+    assert estimator.counts["position_fix_frozen"] > 10
 
 
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
