@@ -1,7 +1,7 @@
 """The `hiernav` command. A sub-command imports what it needs when it runs.
 
-Exit codes: 0 done; 1 training diverged or lost its workers, a replay differs, or a result is damaged; 2 bad input, with
-one line that says what to do; 130 interrupted; 141 nobody reads the output any more; 143 interrupted by SIGTERM.
+Exit codes: 0 done; 1 training diverged, processes died, a replay differs, or a result is damaged; 2 bad input, with one
+line that says what to do; 130 interrupted; 141 nobody reads the output any more; 143 interrupted by SIGTERM.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from hiernav.run import TrainingDiverged, WorkersLost
+from hiernav.run import TrainingDiverged, WorkersLost, check_stage
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -294,9 +294,7 @@ def _train(arguments: argparse.Namespace) -> int:
         from hiernav.finetune import begin_fine_tuning, fine_tuning_config
 
         config = fine_tuning_config(arguments.source, overrides)
-        _check_worlds(config)
-        _check_machine(config)
-        _check_data(config)
+        _check_training(config, arguments.stage)
         run = begin_fine_tuning(config, arguments.source)
     elif arguments.resume:
         if arguments.config or overrides:
@@ -307,9 +305,8 @@ def _train(arguments: argparse.Namespace) -> int:
         run = Run.open(arguments.resume)
     else:
         config = load_config(arguments.config, overrides)
-        _check_worlds(config)
-        _check_machine(config)
-        _check_data(config)
+        _check_collector(config, overrides)
+        _check_training(config, arguments.stage)
         run = Run.create(config)
     from hiernav.training import train
 
@@ -394,7 +391,7 @@ def _watch(arguments: argparse.Namespace) -> int:
     if arguments.view == "mujoco":
         choose_gl()
     from hiernav.evaluate import open_policies
-    from hiernav.film.film import FilmSettings, film_name, make_film
+    from hiernav.film.film import FilmSettings, film_names, make_film
     from hiernav.film.writer import SUFFIXES, default_suffix
     from hiernav.run import newest_run
 
@@ -411,7 +408,7 @@ def _watch(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--out {arguments.out}: the name of a film must end in {' or '.join(SUFFIXES)}")
     out = arguments.out or (Path("runs/films") if arguments.bundle else source / "films")
     if out.suffix not in SUFFIXES:
-        films = {world: out / f"{film_name(world)}{default_suffix()}" for world in worlds}
+        films = {world: out / f"{name}{default_suffix()}" for world, name in film_names(worlds).items()}
     elif len(worlds) == 1:
         films = {worlds[0]: out}
     else:
@@ -498,6 +495,8 @@ def _dataset(arguments: argparse.Namespace) -> int:
     from hiernav.planner.store import read_dataset, read_manifest, write_dataset
 
     overrides = list(arguments.overrides)
+    if arguments.check and (overrides or arguments.config or arguments.samples or arguments.world):
+        raise ValueError("--check reads what is there: leave out --config, --samples, --world and KEY=VALUE")
     if arguments.samples:
         overrides.append(f"planner.samples={arguments.samples}")
     if arguments.world:
@@ -603,14 +602,37 @@ def _config(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check_training(config: TrainConfig, stage: str) -> None:
+    """Refuse what cannot be trained, or not on this machine, before a run folder is made."""
+    check_stage(config, stage)
+    _check_worlds(config)
+    _check_scene(config)
+    _check_machine(config)
+    _check_data(config)
+
+
+def _check_collector(config: TrainConfig, overrides: list[str]) -> None:
+    """Refuse settings of workers and clusters where nobody would ask for them."""
+    from hiernav.config import ConfigError
+
+    skill = config.skill
+    # a file may say it for whenever there are workers
+    if skill.collector == "local" and any(text.startswith("skill.workers=") for text in overrides):
+        raise ConfigError(f"skill.workers = {skill.workers}, expected with skill.collector = 'multi' or 'ray' only")
+    if skill.collector != "ray" and skill.ray_address is not None:
+        raise ConfigError(f"skill.ray_address = {skill.ray_address!r}, expected with skill.collector = 'ray' only")
+
+
 def _check_worlds(config: TrainConfig) -> None:
-    """Refuse worlds that cannot be built or solved before anything is written."""
+    """Refuse worlds that cannot be built or solved, or planned in, before anything is written."""
     from hiernav.config import ConfigError
     from hiernav.planner.mix import WorldRange
+    from hiernav.sim.factory import expert_planner
     from hiernav.sim.layout import parse_world
     from hiernav.sim.robots import get_robot
     from hiernav.sim.worlds import sample_layout
 
+    expert_planner(config)  # no narrower than the robot
     body = get_robot(config.robot).radius
     planned = config.planner.planning_radius_m or body
     for key, texts, radius in (
@@ -624,6 +646,18 @@ def _check_worlds(config: TrainConfig) -> None:
                     sample_layout(spec, 0, radius)
             except ValueError as error:
                 raise ConfigError(f"{key} = {text!r}: {error}") from None
+
+
+def _check_scene(config: TrainConfig) -> None:
+    """Refuse training worlds of the skill that one simulation cannot show in turn."""
+    from hiernav.config import ConfigError
+    from hiernav.sim.layout import parse_world
+    from hiernav.sim.scene import scene_for
+
+    try:
+        scene_for([parse_world(text) for text in config.skill.worlds])
+    except ValueError as error:
+        raise ConfigError(f"skill.worlds = {list(config.skill.worlds)}: {error}") from None
 
 
 def _check_machine(config: TrainConfig) -> None:

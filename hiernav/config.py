@@ -144,7 +144,14 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         float | None, Meta(description="Entropy the temperature aims at [nat]; null: -actions.")
     ] = None
     reward_scale: Annotated[float, Meta(gt=0, description="Factor on the reward that the critics learn from.")] = 1.0
-    eval_every_steps: Annotated[int, Meta(ge=1, description="Steps between evaluations.")] = 10_000
+    eval_every_steps: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="Steps between evaluations, which come at checkpoints: at the first one at or after that many, "
+            "and at the last.",
+        ),
+    ] = 10_000
     eval_episodes: Annotated[int, Meta(ge=1, description="Episodes per evaluation.")] = 100
     checkpoint_every_steps: Annotated[
         int,
@@ -280,8 +287,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 """Section -> preset -> the values that differ from the field defaults."""
 
 
-def load_config(path: str | Path | None = None, overrides: list[str] | None = None) -> TrainConfig:
+def load_config(path: str | Path | None = None, overrides: list[str] | None = None, begun: bool = False) -> TrainConfig:
     """Read a configuration: preset, then file, then `key.path=value` overrides.
+
+    Args:
+        begun: see `check_config`.
 
     Raises:
         ConfigError: the file cannot be read, or a setting in it cannot be used; see `hiernav.decode`.
@@ -308,7 +318,7 @@ def load_config(path: str | Path | None = None, overrides: list[str] | None = No
     def source(key: str) -> str:
         return "command line" if key in from_command_line else name
 
-    return check_config(decode(TrainConfig, _apply_presets(values), source), name)
+    return check_config(decode(TrainConfig, _apply_presets(values), source), name, begun)
 
 
 def dump_config(config: TrainConfig) -> str:
@@ -321,8 +331,11 @@ def describe_config() -> list[FieldHelp]:
     return describe(TrainConfig)
 
 
-def check_config(config: TrainConfig, source: str = "configuration") -> TrainConfig:
+def check_config(config: TrainConfig, source: str = "configuration", begun: bool = False) -> TrainConfig:
     """Check a configuration that was built in Python, and the rules between settings; returns it.
+
+    Args:
+        begun: whether it is that of a run which is there: settings that come to nothing do not keep it from being used.
 
     Raises:
         ConfigError: names the settings, their values and the limit.
@@ -362,7 +375,28 @@ def check_config(config: TrainConfig, source: str = "configuration") -> TrainCon
             f"{source}: reward.path_distance = {reward.path_distance} and reward.progress = {reward.progress}, "
             "expected 0: skill.preset = 'baseline' follows no plan"
         )
+    if not begun:
+        _check_effects(config, source)
     return config
+
+
+def _check_effects(config: TrainConfig, source: str) -> None:
+    planner, skill = config.planner, config.skill
+    if skill.batch_size > skill.total_steps:
+        raise ConfigError(
+            f"{source}: skill.batch_size = {skill.batch_size}, expected <= skill.total_steps = {skill.total_steps}: "
+            "there would be no update"
+        )
+    if skill.alpha_floor == 0 and skill.alpha_floor_end is not None:
+        raise ConfigError(
+            f"{source}: skill.alpha_floor_end = {skill.alpha_floor_end:g}, expected null with skill.alpha_floor = 0, "
+            "which cannot fall"
+        )
+    if planner.preset == "paper" and planner.hypotheses != 1:
+        raise ConfigError(
+            f"{source}: planner.hypotheses = {planner.hypotheses}, expected 1 with planner.preset = 'paper', "
+            "whose network proposes one plan"
+        )
 
 
 def _read(path: Path) -> dict[str, Any]:

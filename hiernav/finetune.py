@@ -49,7 +49,7 @@ def fine_tuning_config(source: str | Path, overrides: list[str]) -> TrainConfig:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "config.yaml"
         file.write_text(dump_config(_source_config(Path(source))))
-        return load_config(file, values)
+        return load_config(file, values, begun=True)
 
 
 def begin_fine_tuning(config: TrainConfig, source: str | Path) -> Run:

@@ -26,7 +26,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from hiernav.config import TrainConfig, dump_config, load_config
+from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
 from hiernav.lock import FolderLock
 
 
@@ -43,7 +43,7 @@ _LOGS = {"metrics_length": "metrics.jsonl", "rates_length": "rates.jsonl"}
 
 
 class WorkersLost(RuntimeError):
-    """The workers that simulate die whenever they are started; the last checkpoint is from before."""
+    """Processes that simulate, or that make samples, have died for good; what was saved before is as it was."""
 
 
 class Run:
@@ -53,6 +53,7 @@ class Run:
         self.path, self.config = path, config
         self._writer: Any = None
         self._began: dict[str, float] = {}
+        self._rewound = False
         self._lock = FolderLock(path)
 
     @classmethod
@@ -93,7 +94,7 @@ class Run:
         path = Path(path)
         if not (path / "config.yaml").is_file():
             raise RunError(f"{path} is not a run folder: it has no config.yaml; `hiernav train` makes one")
-        return cls(path, load_config(path / "config.yaml"))
+        return cls(path, load_config(path / "config.yaml", begun=True))
 
     def log(self, stage: str, step: int, values: Mapping[str, float]) -> None:
         """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves `stage/...`."""
@@ -146,6 +147,7 @@ class Run:
         """
         if rewind:
             with self.writing():
+                self._rewound = True
                 # every stage: the skill's metrics are newer than the planner's checkpoint and must stay
                 known = [_read_checkpoint(file) for file in self.path.glob("*/checkpoint.pt")]
                 for key, name in _LOGS.items():
@@ -193,15 +195,31 @@ class Run:
     def _append(self, log: str, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
         known = {key: value if math.isfinite(value) else None for key, value in values.items()}
         with self.writing():
+            purge_step = self._purge_step(step) if self._writer is None else None
             with (self.path / log).open("a") as file:
                 file.write(json.dumps({"stage": stage, "step": step, **known}) + "\n")
             if self._writer is None:
                 from torch.utils.tensorboard import SummaryWriter
 
-                self._writer = SummaryWriter(str(self.path / "tensorboard"))
+                self._writer = SummaryWriter(str(self.path / "tensorboard"), purge_step=purge_step)
             for key, value in known.items():
                 if value is not None:
                     self._writer.add_scalar(f"{curves}/{key}", value, step)
+
+    def _purge_step(self, step: int) -> int | None:
+        """Where curves that go on with `step` are to cut off what an earlier process has drawn after its checkpoint.
+
+        None where there is nothing to cut off, or where more would go: TensorBoard cuts the curves of all stages alike.
+        """
+        rewound, self._rewound = self._rewound, False
+        log = self.path / "metrics.jsonl"
+        if not rewound or not log.exists():
+            return None
+        try:
+            kept = max((line["step"] for line in map(_json_object, log.read_text().splitlines())), default=-1)
+            return step if kept < step else None
+        except _DAMAGED:
+            return None  # a curve that doubles back is no reason not to train
 
     def close(self) -> None:
         """End the curves, and let other processes write to the folder."""
@@ -219,6 +237,24 @@ class Run:
     def _hold(self) -> None:
         if not self._lock.acquire():
             raise RunError(f"{self.path} is in use: another process trains in it; wait until it has ended, or stop it")
+
+
+def check_stage(config: TrainConfig, stage: str, planned: bool = False) -> None:
+    """Refuse to train a stage that a configuration does not have, or that has to wait for the planner.
+
+    Args:
+        stage: "planner", "skill" or "all".
+        planned: whether the run has a trained planner.
+
+    Raises:
+        ConfigError: names the setting.
+    """
+    if stage == "planner" and config.skill.preset == "baseline":
+        raise ConfigError("skill.preset = 'baseline' follows no plan: it has no planner stage")
+    if stage == "skill" and config.skill.planner == "cnn" and not planned:
+        raise ConfigError(
+            "skill.planner = 'cnn' needs a trained planner: train it first, with --stage planner, or both, with all"
+        )
 
 
 def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None]) -> None:

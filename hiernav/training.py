@@ -11,7 +11,7 @@ from rich.progress import Progress, TaskID
 from hiernav.nav.option import Planner
 from hiernav.nav.planners import VerifiedPlanner
 from hiernav.planner import train as planner_train
-from hiernav.run import Run
+from hiernav.run import Run, check_stage
 from hiernav.sim.factory import expert_planner
 from hiernav.sim.robots import get_robot
 from hiernav.skill import train as skill_train
@@ -26,6 +26,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         KeyboardInterrupt: somebody pressed Ctrl-C, whatever a library that was interrupted made of it.
         TrainingDiverged: a loss, a weight or the physics is not finite.
         RunError: the run folder cannot be written to.
+        ConfigError: see `hiernav.run.check_stage`.
     """
     try:
         _train(run, stage, progress)
@@ -42,11 +43,11 @@ def train(run: Run, stage: str, progress: Progress) -> None:
 def _train(run: Run, stage: str, progress: Progress) -> None:
     torch.set_num_threads(run.config.threads)
     if run.config.skill.preset == "baseline":
-        if stage == "planner":
-            raise ValueError("skill.preset = baseline follows no plan: it has no planner stage")
+        check_stage(run.config, stage)
         return _train_skill(run, None, progress)
     planner = planner_train.PlannerTrainer(run.config, run)
     done = planner.resume()
+    check_stage(run.config, stage, planner.finished)
     if done and not planner.finished:
         _say_resumed(progress, run, "planner", f"epoch {done} of {run.config.planner.epochs}")
     if stage in ("planner", "all") and not planner.finished:
@@ -56,8 +57,6 @@ def _train(run: Run, stage: str, progress: Progress) -> None:
     if stage in ("skill", "all"):
         guide: Planner | None = None
         if run.config.skill.planner == "cnn":
-            if not planner.finished:
-                raise ValueError("skill.planner = cnn needs a trained planner: run the planner stage first")
             guide = planner_train.torch_planner(planner.network.cpu(), planner.labels)
             if run.config.skill.preset != "paper":
                 guide = VerifiedPlanner(guide, expert_planner(run.config), get_robot(run.config.robot).radius)

@@ -98,6 +98,7 @@ def test_a_configuration_that_cannot_be_used_is_named_by_file_and_key(refused, t
             "skill.worlds = 'pillar(0.6,0.6,9)': .* use fewer obstacles or a larger field",
         ),
         ("planner.planning_radius_m=3", "planner.worlds = 'pillar.*none of 100 layouts .* a smaller robot"),
+        ("planner.planning_radius_m=0.05", "planning_radius_m = 0.05, expected at least 0.1, the radius of the point"),
         (
             "skill.worlds=['map(hall.yaml)']",
             "skill.worlds = 'map(hall.yaml)': .*: the map file cannot be read",
@@ -108,6 +109,44 @@ def test_training_refuses_a_setting_before_it_makes_a_folder(refused, override, 
     line = refused("train", *tiny_run.SETTINGS, override)
     first, *rest = part.split(".*")
     assert first in line and all(piece.strip() in line for piece in rest)
+
+
+def test_worlds_that_cannot_share_a_simulation_are_refused_for_training_alone(refused, tmp_path):
+    write_map(tmp_path, np.zeros((40, 40), dtype=bool))
+    settings = [*tiny_run.SETTINGS, "planner.samples=2", "skill.worlds=['map(hall.yaml)', 'pillar(2,2,10)']"]
+    line = refused("train", *settings)
+    assert "skill.worlds = ['map(hall.yaml)', 'pillar(2,2,10)']: " in line and "the only world of its scene" in line
+    assert cli.main(["dataset", "--out", "data", *settings]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--stage", "planner", "skill.preset=baseline"], "skill.preset = 'baseline' follows no plan: it has no"),
+        (["--stage", "skill", "skill.planner=cnn"], "skill.planner = 'cnn' needs a trained planner: train it first"),
+        (["--workers", "8"], "skill.workers = 8, expected with skill.collector = 'multi' or 'ray' only"),
+        (["skill.workers=8"], "skill.workers = 8, expected with skill.collector = 'multi' or 'ray' only"),
+        (
+            ["--collector", "multi", "--workers", "8", "--ray-address", "local"],
+            "skill.ray_address = 'local', expected with skill.collector = 'ray' only",
+        ),
+    ],
+)
+def test_what_would_be_ignored_or_fail_later_is_refused_before_a_run_folder_is_made(refused, arguments, part):
+    assert part in refused("train", "planner.data=nowhere", *arguments)
+
+
+def test_a_data_set_for_a_robot_that_is_wider_than_its_plans_is_not_begun(refused):
+    line = refused("dataset", "--out", "data", *tiny_run.SETTINGS, "planner.planning_radius_m=0.05")
+    assert "planner.planning_radius_m = 0.05, expected at least 0.1" in line
+
+
+@pytest.mark.parametrize(
+    "more", [["--config", "robot.yaml"], ["--samples", "5"], ["--world", "pillar(2,2,10)"], ["seed=3"]]
+)
+def test_what_a_check_of_a_data_set_does_not_look_at_is_refused(refused, more):
+    line = refused("dataset", "--out", "data", "--check", *more)
+    assert "--check reads what is there: leave out --config, --samples, --world and KEY=VALUE" in line
 
 
 @pytest.mark.parametrize("command", ["world", "train", "evaluate"])

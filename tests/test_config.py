@@ -260,6 +260,19 @@ def test_an_override_into_a_section_of_a_wrong_type_blames_the_file(tmp_path: Pa
     ("overrides", "parts"),
     [
         (["skill.buffer_size=100"], ["skill.batch_size = 256", "skill.buffer_size = 100"]),
+        (
+            ["skill.total_steps=200", "skill.learning_starts=0"],
+            ["skill.batch_size = 256", "expected <= skill.total_steps = 200"],
+        ),
+        (
+            ["skill.alpha_floor=0", "skill.alpha_floor_end=0.002"],
+            ["skill.alpha_floor_end = 0.002", "expected null", "skill.alpha_floor = 0"],
+        ),
+        (["skill.preset=paper", "skill.alpha_floor_end=0.0"], ["skill.alpha_floor_end = 0", "skill.alpha_floor = 0"]),
+        (
+            ["planner.preset=paper", "planner.hypotheses=6"],
+            ["planner.hypotheses = 6", "expected 1", "planner.preset = 'paper'"],
+        ),
         (["skill.total_steps=1000"], ["skill.learning_starts = 2000", "skill.total_steps = 1000"]),
         (["skill.preset=baseline", "reward.preset=default"], ["reward.path_distance", "baseline"]),
         (["option.waypoints=12"], ["option.waypoints = 12", "expected 10", "observes"]),
@@ -270,6 +283,21 @@ def test_settings_that_contradict_each_other_are_refused(overrides: list[str], p
     message = error_of(None, *overrides)
     for part in parts:
         assert part in message
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["skill.total_steps=200", "skill.learning_starts=0"],
+        ["skill.alpha_floor=0", "skill.alpha_floor_end=0.002"],
+        ["planner.preset=paper", "planner.hypotheses=6"],
+    ],
+)
+def test_what_comes_to_nothing_does_not_keep_an_older_run_from_being_read(tmp_path: Path, settings: list[str]) -> None:
+    config = load_config(None, settings, begun=True)
+    path = write(tmp_path, dump_config(config))
+    assert load_config(path, begun=True) == config
+    assert "expected" in error_of(path)
 
 
 def test_a_skill_observes_as_many_waypoints_as_plans_must_have_and_a_baseline_none() -> None:
@@ -296,6 +324,7 @@ unit = st.floats(0, 1, exclude_min=True)
 
 @st.composite
 def configs(draw: st.DrawFn) -> TrainConfig:
+    network = draw(st.sampled_from(["default", "paper"]))
     reward: dict[str, Any] = {
         name: draw(finite) for name in ("path_distance", "progress", "collision", "goal", "goal_distance")
     }
@@ -306,7 +335,8 @@ def configs(draw: st.DrawFn) -> TrainConfig:
             st.none() | st.text(min_size=1) | st.sampled_from(["null", "true", "1e3", "-", "2024", "a: b", "<<", "#"])
         ),
         planner=PlannerConfig(
-            preset=draw(st.sampled_from(["default", "paper"])),
+            preset=network,
+            hypotheses=1 if network == "paper" else draw(st.integers(1, 16)),
             worlds=tuple(draw(st.lists(st.sampled_from(["pillar(2,2,10)", "gremlin", "map(a b.yaml)"]), min_size=1))),
             mirror=draw(st.booleans()),
         ),
@@ -352,6 +382,7 @@ def test_help_describes_every_setting_with_its_type_and_default() -> None:
     assert described["skill.stop_reach_rate"].type == "null or float > 0 and <= 1"
     assert described["planner.worlds"].type.startswith("list of at least 1 of: a world")
     assert math.isclose(described["option.d_update_m"].default, 0.3)
+    assert "at checkpoints: at the first one at or after that many" in described["skill.eval_every_steps"].description
 
 
 @pytest.mark.parametrize("name", ["\x85", "\u2028runs", "größe"])

@@ -63,6 +63,11 @@ def test_a_run_whose_configuration_is_broken_is_named(run):
         Run.open(run.path)
 
 
+def test_a_run_from_before_a_setting_was_refused_can_still_be_opened(run):
+    (run.path / "config.yaml").write_text("planner: {preset: paper, hypotheses: 6}\n")
+    assert Run.open(run.path).config.planner.hypotheses == 6
+
+
 def test_a_file_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "checkpoint.pt"
     write_atomically(file, b"old")
@@ -215,6 +220,37 @@ def test_metrics_are_one_json_object_a_line_and_curves(run):
     ]
     run.close()
     assert [file.name.partition(".tfevents")[0] for file in (run.path / "tensorboard").iterdir()] == ["events.out"]
+
+
+def curve(run: Run, tag: str) -> list[tuple[int, float]]:
+    """Steps and values, as TensorBoard reads them."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run.path / "tensorboard"))
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)]
+
+
+@pytest.mark.train
+@pytest.mark.parametrize("trained_before", [False, True])
+def test_a_curve_goes_on_from_the_checkpoint_and_those_of_other_stages_stay(run, trained_before):
+    if trained_before:  # a skill that needed no planner
+        run.log("skill", 500, {"reach_rate": 0.75})
+        run.save("skill", {"steps": 500})
+    for step in (1, 2):
+        run.log("planner", step, {"loss": 1.0 / step})
+        if step == 1:
+            run.save("planner", {"epoch": 1})
+    run.close()
+    again = Run.open(run.path)
+    again.load("planner", rewind=True)
+    again.log("planner", 2, {"loss": 0.25})
+    again.log("planner", 3, {"loss": 0.125})
+    again.close()
+    if trained_before:
+        assert curve(run, "skill/reach_rate") == [(500, 0.75)]
+    else:
+        assert curve(run, "planner/loss") == [(1, 1.0), (2, 0.25), (3, 0.125)]
 
 
 @pytest.mark.train

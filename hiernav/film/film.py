@@ -114,6 +114,18 @@ def film_name(world: WorldSpec) -> str:
     return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
 
 
+def film_names(worlds: Sequence[WorldSpec]) -> dict[WorldSpec, str]:
+    """Names of the films of several worlds, no two alike: maps of one name in different folders get numbers."""
+    names: dict[WorldSpec, str] = {}
+    for world in worlds:
+        name, number = film_name(world), 1
+        while name in names.values():
+            number += 1
+            name = f"{film_name(world)}-{number}"
+        names[world] = name
+    return names
+
+
 class _Camera:
     """Turns the control steps of a task with one row into the frames of a film."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, TypeVar
@@ -20,6 +21,7 @@ from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.search import PathField, random_shortcuts, resample
 from hiernav.planner.mix import WorldMix
+from hiernav.run import WorkersLost
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
@@ -127,7 +129,11 @@ def make_samples(
     processes: int = 1,
     on_progress: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Draw worlds and label starts in them; the result depends on the seed alone, not on `processes`."""
+    """Draw worlds and label starts in them; the result depends on the seed alone, not on `processes`.
+
+    Raises:
+        WorkersLost: see `map_tasks`.
+    """
     worlds = -(-count // settings.samples_per_world)
     tasks = [
         (settings, tuple(seed), first, min(_WORLDS_PER_TASK, worlds - first))
@@ -142,13 +148,23 @@ def make_samples(
 
 
 def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], processes: int) -> Iterator[T]:
-    """Results of `function(*task)` in the order of the tasks, computed here or in several processes."""
+    """Results of `function(*task)` in the order of the tasks, computed here or in several processes.
+
+    Raises:
+        WorkersLost: one of these died.
+    """
     if processes == 1 or len(tasks) == 1:
         for task in tasks:
             yield function(*task)
         return
-    with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
-        yield from pool.map(function, *zip(*tasks, strict=True))
+    try:
+        with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
+            yield from pool.map(function, *zip(*tasks, strict=True))
+    except BrokenProcessPool as error:
+        raise WorkersLost(
+            f"one of {processes} processes that make samples died, as it happens where memory runs out: "
+            "begin again with fewer threads"
+        ) from error
 
 
 def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:

@@ -79,6 +79,7 @@ def write_dataset(
         DatasetError: the folder holds a data set of another kind, one with more samples, or a damaged one, or another
             process writes to it.
         OSError: it cannot be written to.
+        WorkersLost: see `map_tasks`.
     """
     folder, wanted = Path(folder), Manifest(FORMAT_VERSION, settings, seed, count, ())
     _begun(folder, wanted)  # before anything is written
@@ -120,6 +121,8 @@ def _make_missing(
         kept += 1
     shards = list(manifest.shards[:kept])
     tasks = [(folder, settings, manifest.seed, number, worlds, wanted[number]) for number in range(kept, len(wanted))]
+    if not tasks:  # all are there, though more may have been wanted before
+        _write_manifest(folder, manifest)
     done = sum(shard.samples for shard in shards)
     if on_progress is not None:
         on_progress(done)
@@ -127,7 +130,7 @@ def _make_missing(
         shards.append(shard)
         done += shard.samples
         manifest = msgspec.structs.replace(manifest, shards=tuple(shards))
-        _write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+        _write_manifest(folder, manifest)
         if on_progress is not None:
             on_progress(done)
     return msgspec.structs.replace(manifest, shards=tuple(shards))
@@ -232,6 +235,10 @@ def _read_shard(file: Path, shard: Shard, settings: LabelSettings) -> Samples:
         if values.dtype != np.uint8 and not np.isfinite(values).all():
             raise DatasetError(f"{file}: {name} is not finite everywhere")
     return Samples(**parts)
+
+
+def _write_manifest(folder: Path, manifest: Manifest) -> None:
+    _write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
 
 
 def _write(path: Path, data: bytes) -> None:

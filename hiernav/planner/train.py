@@ -73,14 +73,12 @@ class PlannerTrainer:
             planner.preset, config.option.waypoints, config.option.spacing_m, planner.hypotheses
         ).to(self.device, memory_format=torch.channels_last)
         self.precision = choose_precision(planner.precision, self.device)
-        self.labels = label_settings(config) if planner.data is None else settings_of_data(config)
+        self.labels = label_settings(config)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=planner.learning_rate, weight_decay=planner.weight_decay
         )
         batches = -(-planner.samples // planner.batch_size)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimizer, planner.learning_rate, total_steps=planner.epochs * batches, pct_start=0.1
-        )
+        self.schedule = one_cycle(self.optimizer, planner.learning_rate, planner.epochs * batches)
         self.epoch = 0
         self.validation: dict[str, float] = {}
         self._given = False  # whether training starts from weights that were trained elsewhere
@@ -116,6 +114,8 @@ class PlannerTrainer:
 
         Raises:
             TrainingDiverged: the loss or the network is not finite.
+            WorkersLost: a process that makes samples died.
+            DatasetError: see `settings_of_data` and `read_dataset`.
             RunError: the run folder cannot be written to.
         """
         if self.finished:
@@ -133,6 +133,7 @@ class PlannerTrainer:
             report("data set", done, planner.samples)
 
         if planner.data is not None:
+            self.labels = settings_of_data(self.config)
             samples = read_dataset(planner.data, planner.samples, made)
         else:
             samples = make_samples(self.labels, planner.samples, data_seed(self.config), self.config.threads, made)
@@ -185,9 +186,12 @@ class PlannerTrainer:
     def _diverged(self, what: str) -> TrainingDiverged:
         path = self.run.path
         kept = f"the last checkpoint is of epoch {self.epoch}" if self.epoch else "there is no checkpoint yet"
+        if self.config.planner.data is None:
+            advice = f", with another seed in {path / 'config.yaml'} other samples follow"
+        else:
+            advice = "; begin a new run with another planner.learning_rate or seed"
         return TrainingDiverged(
-            f"{what} of epoch {self.epoch + 1}, and {kept}: `hiernav train --resume {path}` repeats it, with another "
-            f"seed in {path / 'config.yaml'} other samples follow"
+            f"{what} of epoch {self.epoch + 1}, and {kept}: `hiernav train --resume {path}` repeats it{advice}"
         )
 
     @property
@@ -247,6 +251,12 @@ class PlannerTrainer:
                 "validation": self.validation,
             },
         )
+
+
+def one_cycle(optimizer: torch.optim.Optimizer, peak: float, updates: int) -> torch.optim.lr_scheduler.OneCycleLR:
+    """Learning rate over so many updates: up to `peak` in the first tenth, then down to next to nothing."""
+    rise = 0.2 if updates == 10 else 0.1  # OneCycleLR divides by the updates of the rise less one
+    return torch.optim.lr_scheduler.OneCycleLR(optimizer, peak, total_steps=updates, pct_start=rise)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ _EVALUATION_SEED = 0xE7A1
 _COLLISION = 0.01
 """Share of an arrival that a collision costs where actors are compared."""
 _LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
+_ENDS = tuple(r for r in TerminationReason if r not in (TerminationReason.NONE, TerminationReason.START))
+"""Why plans end in the course of an episode: its first one is made before any step."""
 
 
 @dataclass
@@ -144,10 +146,18 @@ class TorchSkill:
 
 
 class SkillTrainer:
-    """One training of the skill within a run folder."""
+    """One training of the skill within a run folder.
+
+    Raises:
+        RunError: the run's skill is another run's or a bundle's, or there is no room for the replay.
+    """
 
     def __init__(self, config: TrainConfig, run: Run, planner: Planner | None = None) -> None:
         self.config, self.run, self.planner = config, run, planner
+        if (run.load("skill") or {}).get("imported"):
+            raise RunError(
+                f"the skill of {run.path} comes from another run or a bundle: it drives, but cannot be trained on"
+            )
         self._plans = self._plan_counts()
         skill = config.skill
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
@@ -178,15 +188,11 @@ class SkillTrainer:
         """Go back to the last checkpoint; its number of steps, or None if there is none.
 
         Raises:
-            RunError: the skill cannot be trained on: it is another run's or a bundle's, or its replay is gone.
+            RunError: the skill cannot be trained on: its replay is gone.
         """
         state = self.run.load("skill", rewind=True)
         if state is None:
             return None
-        if state.get("imported"):
-            raise RunError(
-                f"the skill of {self.run.path} comes from another run or a bundle: it drives, but cannot be trained on"
-            )
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         restore_random_state(state, self.learner.device)
@@ -308,7 +314,7 @@ class SkillTrainer:
             "collisions_per_step": float(data["next", "collided"].float().mean()),
             "updates": self.learner.updates,
             **{f"reward/{name}": value for name, value in zip(TERMS, terms, strict=True)},
-            **{f"replans/{r.name.lower()}": float(reasons[r] / reasons.sum()) for r in TerminationReason if r},
+            **{f"replans/{r.name.lower()}": float(reasons[r] / reasons.sum()) for r in _ENDS},
             **self._new_plans(),
         }
 

@@ -20,7 +20,7 @@ from hiernav.config import load_config
 from hiernav.evaluate import Policies, evaluate
 from hiernav.film import film as film_module
 from hiernav.film.caption import LEAST_WIDTH, caption
-from hiernav.film.film import FilmSettings, film_name, make_film
+from hiernav.film.film import FilmSettings, film_name, film_names, make_film
 from hiernav.nav.option import TerminationReason
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
@@ -116,12 +116,23 @@ def test_films_are_named_after_their_world(world, name):
     assert film_name(parse_world(world)) == name
 
 
-def test_a_film_of_a_map_is_named_after_the_map(tmp_path):
-    cv2.imwrite(str(tmp_path / "hall.png"), np.pad(np.full((60, 80), 254, np.uint8), 10))
-    (tmp_path / "hall.yaml").write_text(
-        "image: hall.png\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+def write_map(file: Path) -> Path:
+    file.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(file.with_suffix(".png")), np.pad(np.full((60, 80), 254, np.uint8), 10))
+    file.write_text(
+        f"image: {file.stem}.png\n"
+        "resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
-    assert film_name(parse_world(str(tmp_path / "hall.yaml"))) == "map-hall"
+    return file
+
+
+def test_films_of_maps_are_named_after_the_maps_and_none_replaces_another(tmp_path):
+    files = [write_map(tmp_path / name) for name in ("a/hall.yaml", "b/hall.yaml", "c/hall.yaml", "a/hall-2.yaml")]
+    worlds = [parse_world(str(file)) for file in files]
+    assert film_name(worlds[0]) == film_name(worlds[1]) == "map-hall"
+    assert list(film_names(worlds).items()) == list(
+        zip(worlds, ("map-hall", "map-hall-2", "map-hall-3", "map-hall-2-2"), strict=True)
+    )
 
 
 def test_the_caption_tells_how_an_episode_ended():
@@ -197,6 +208,15 @@ def test_a_run_is_filmed_into_its_own_folder(run, capsys):
     said = capsys.readouterr()
     assert [line.partition(": ")[0] for line in said.out.splitlines()] == [str(film) for film in films]
     assert "frames/s" in said.err
+
+
+@pytest.mark.train
+def test_maps_of_one_name_are_filmed_into_different_files(run, capsys, monkeypatch):
+    worlds = [option for name in "ab" for option in ("--world", f"map({write_map(Path(name) / 'hall.yaml')})")]
+    monkeypatch.setattr(film_module, "make_film", lambda *_, **__: [])
+    assert cli.main(["watch", str(run), *worlds]) == 0
+    films = [Path(line.partition(": ")[0]).stem for line in capsys.readouterr().out.splitlines()]
+    assert films == ["map-hall", "map-hall-2"]
 
 
 @pytest.mark.train

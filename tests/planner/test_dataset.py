@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, nearest_pixel
 from hiernav.planner import dataset
-from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples
+from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples, map_tasks
+from hiernav.run import WorkersLost
 from hiernav.sim.layout import parse_world
 from hiernav.sim.worlds import Layout, sample_layout
 
@@ -69,6 +71,11 @@ def test_samples_depend_on_the_seed_and_not_on_the_number_of_processes():
     alone = make_samples(settings, 30, (7, 1), processes=1)
     assert same(alone, make_samples(settings, 30, (7, 1), processes=2))
     assert not same(alone, make_samples(settings, 30, (7, 2), processes=1))
+
+
+def test_a_process_that_is_killed_while_it_makes_samples_is_told_in_one_line():
+    with pytest.raises(WorkersLost, match=r"^one of 2 processes that make samples died, [^\n]*with fewer threads$"):
+        list(map_tasks(os._exit, [(9,), (9,)], 2))
 
 
 def test_a_count_that_is_no_multiple_of_the_samples_per_world_is_met():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +20,15 @@ from hiernav.planner import passes, table  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
 from hiernav.planner.dataset import data_seed  # noqa: E402
 from hiernav.planner.store import DatasetError, write_dataset  # noqa: E402
-from hiernav.planner.train import LossWeights, PlannerTrainer, clearance_at, load_network, plan_loss, reflect  # noqa: E402
+from hiernav.planner.train import (  # noqa: E402
+    LossWeights,
+    PlannerTrainer,
+    clearance_at,
+    load_network,
+    one_cycle,
+    plan_loss,
+    reflect,
+)
 from hiernav.run import Run, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
@@ -45,6 +55,7 @@ def test_the_loss_falls_on_a_small_set(tmp_path, preset, left):
     trainer = trainer_in(
         tmp_path / "run",
         f"planner.preset={preset}",
+        f"planner.hypotheses={1 if preset == 'paper' else 2}",
         "planner.epochs=12",
         "planner.learning_rate=3e-3",
         "planner.clearance_weight=0",
@@ -57,6 +68,25 @@ def test_the_loss_falls_on_a_small_set(tmp_path, preset, left):
         assert metrics[-1]["error"] < 0.5 * metrics[0]["error"]
     assert set(metrics[-1]) >= {"walk_collisions", "walk_reach_rate", "blocked_waypoints"}
     assert trainer.finished
+
+
+@pytest.mark.parametrize("updates", range(1, 31))
+def test_the_learning_rate_rises_and_falls_over_any_number_of_updates(updates):
+    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))])
+    schedule, rates = one_cycle(optimizer, 1e-3, updates), []
+    for _ in range(updates):
+        rates.append(schedule.get_last_lr()[0])
+        optimizer.step()
+        schedule.step()
+    assert all(0.0 < rate <= 1e-3 for rate in rates) and rates[-1] == pytest.approx(4e-9)
+    top = rates.index(max(rates))
+    assert top <= max(1, updates // 10) and rates == sorted(rates[:top]) + sorted(rates[top:], reverse=True)
+
+
+def test_a_training_of_ten_updates_is_one(tmp_path):
+    trainer = trainer_in(tmp_path / "run", "planner.samples=10", "planner.epochs=10")
+    trainer.train()
+    assert trainer.schedule.total_steps == trainer.schedule.last_epoch == 10
 
 
 def test_a_trained_network_is_read_back_from_the_run(tmp_path):
@@ -254,12 +284,30 @@ def test_training_on_a_data_set_from_disk_is_training_on_samples_of_the_run_s_ow
     from_disk.train()
     weights, again = own.network.state_dict(), from_disk.network.state_dict()
     assert all(torch.equal(weights[key], again[key]) for key in weights)
+    shutil.rmtree(tmp_path / "data")
+    run = Run.open(tmp_path / "disk")
+    later = PlannerTrainer(run.config, run)
+    assert later.resume() == 2 and later.finished, "what it has learnt needs no data"
+    with pytest.raises(DatasetError, match="is no data set"):
+        trainer_in(tmp_path / "new", f"planner.data={tmp_path / 'data'}").train()
+
+
+@pytest.mark.parametrize(
+    ("settings", "advice"),
+    [
+        ((), r"repeats it, with another seed in \S+config\.yaml other samples follow$"),
+        (("planner.data=given",), r"repeats it; begin a new run with another planner\.learning_rate or seed$"),
+    ],
+)
+def test_the_advice_after_a_divergence_is_one_that_changes_something(tmp_path, settings, advice):
+    diverged = trainer_in(tmp_path / "run", *settings)._diverged("loss not finite")
+    assert re.search(advice, str(diverged))
 
 
 def test_a_data_set_for_another_robot_or_network_is_refused(tmp_path):
     write_dataset(tmp_path / "data", replace(trainer_in(tmp_path / "run").labels, radius=0.2), 12, (0,))
     with pytest.raises(DatasetError, match=r"made with radius = 0.2, this run plans with 0.1"):
-        trainer_in(tmp_path / "other", f"planner.data={tmp_path / 'data'}")
+        trainer_in(tmp_path / "other", f"planner.data={tmp_path / 'data'}").train()
 
 
 def test_a_planner_of_table_2_gets_the_updates_that_are_told_of_it(tmp_path, monkeypatch):

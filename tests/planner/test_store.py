@@ -70,6 +70,22 @@ def test_an_interrupted_data_set_goes_on_where_it_was(tmp_path: Path, monkeypatc
     assert same(read_dataset(tmp_path / "data"), make_samples(SETTINGS, 20, SEED))
 
 
+def test_an_interrupted_data_set_is_whole_once_no_more_is_wanted(tmp_path: Path, monkeypatch):
+    make_shard = store._make_shard
+
+    def interrupted(*task):
+        if task[3] == 2:
+            raise KeyboardInterrupt
+        return make_shard(*task)
+
+    monkeypatch.setattr(store, "_make_shard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(tmp_path / "data", SETTINGS, 20, SEED)
+    made = write_dataset(tmp_path / "data", SETTINGS, 16, SEED)
+    assert made.finished and made == read_manifest(tmp_path / "data")
+    assert same(read_dataset(tmp_path / "data"), make_samples(SETTINGS, 16, SEED))
+
+
 def test_a_data_set_can_be_made_larger(folder: Path):
     reported: list[int] = []
     write_dataset(folder, SETTINGS, 30, SEED, on_progress=reported.append)

@@ -13,12 +13,13 @@ import numpy as np
 from hiernav.nav.bundle import load_bundle
 from hiernav.runtime.about import About
 from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.delayed_planner import DelayedPlanner
 from hiernav.runtime.driver import Driver, DriverConfig, RunResult
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
 from hiernav.runtime.guard import GuardConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
-from hiernav.runtime.policy import make_agent
+from hiernav.runtime.policy import load_policies, make_agent, make_planner
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise, SimRobot
 from hiernav.sim.layout import GOAL_RADIUS, Layout, parse_world
@@ -45,8 +46,8 @@ class Memory(Observer):
 ESTIMATOR = EstimatorConfig(tilts=False)
 
 
-def about() -> About:
-    """What a recording of `drive` says of itself."""
+def about(late: bool = False) -> About:
+    """What a recording of `drive` says of itself; `late`: plans came later than they were asked for."""
     spec, bundle = get_robot("point"), load_bundle(BUNDLE)
     return About(
         robot="point",
@@ -55,7 +56,7 @@ def about() -> About:
         control_period=spec.control_period,
         bundle=str(BUNDLE),
         hashes=dict(bundle.manifest.files),
-        planner_process=False,
+        planner_process=late,
         estimator=ESTIMATOR,
         guard=GuardConfig(),
         predict=True,
@@ -70,13 +71,15 @@ def drive(
     noise: SensorNoise | None = None,
     damage: Callable[[SensorFrame], SensorFrame] = lambda frame: frame,
     pinned_from: float = math.inf,
+    delay: float | None = None,
 ) -> RunResult:
     """Drive the point robot through one world, told to `observers`.
 
-    `damage` is done to every frame; from the time `pinned_from` [s] on no command reaches the robot.
+    `damage` is done to every frame; from the time `pinned_from` [s] on no command reaches the robot; with a `delay`,
+    plans come so much later than they are asked for [s], as from a process of its own.
     """
     layout = sample_layout(parse_world(world), seed, get_robot("point").radius)
-    with _driver(layout, noise, damage, pinned_from) as driver:
+    with _driver(layout, noise, damage, pinned_from, delay=delay) as driver:
         driver.audience.observers = list(observers)
         return driver.run(layout.goal, max_steps)
 
@@ -113,13 +116,19 @@ def serve(
 
 
 @contextmanager
-def _driver(layout: Layout, noise: SensorNoise | None, *hindrances: Any) -> Iterator[Driver]:
-    spec = get_robot("point")
+def _driver(
+    layout: Layout, noise: SensorNoise | None, *hindrances: Any, delay: float | None = None
+) -> Iterator[Driver]:
+    spec, bundle = get_robot("point"), load_bundle(BUNDLE)
     robot = SimRobot(spec, layout, noise, layout.seed)
+    link = None
+    if delay is not None:
+        network = load_policies(bundle).planner
+        link = DelayedPlanner(make_planner(bundle, network, spec.radius, GOAL_RADIUS), delay)
     try:
         yield Driver(
             _Hindered(robot, *hindrances),
-            Pilot(make_agent(load_bundle(BUNDLE), spec.radius, GOAL_RADIUS)),
+            Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS, link), link),
             robot.occupancy,
             FakeClock(),
             Estimator(ESTIMATOR),

@@ -28,7 +28,7 @@ from hiernav.runtime.supervisor import Mode
 
 def recorded(path, *runs, change=lambda record: record):
     """A recording of several runs, each given as keywords of `drive`."""
-    recorder = Recorder(path, about().metadata())
+    recorder = Recorder(path, about(late=any("delay" in run for run in runs)).metadata())
 
     class Changed(Observer):
         def tick(self, record):
@@ -57,6 +57,22 @@ def test_everything_that_was_decided_is_decided_again_bit_for_bit(tmp_path, bund
     assert result.compared["estimate"] == result.ticks
     assert result.compared["proposed"] == result.compared["plan"] > 150
     assert result.compared["sent"] > 150
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.25])
+def test_plans_that_came_late_are_made_again_from_what_was_asked(tmp_path, bundle, delay):
+    runs = [{"seed": 1, "delay": delay}, {"seed": 2, "world": "gremlin", "delay": delay}]
+    log = recorded(tmp_path / "late.mcap", *runs)
+    late = [tick for tick in log.ticks() if tick.replanned and tick.plan_stamp < tick.estimate.stamp]
+    result = Replay(log, bundle).compare()
+    assert result.equal and len(late) >= 10 and result.compared["plan"] > 100 + len(late), result.difference
+    wrong = recorded(
+        tmp_path / "wrong.mcap",
+        runs[0],
+        change=lambda r: replace(r, plan=r.plan + 1e-15) if r.replanned and r.index == late[3].index else r,
+    )
+    difference = Replay(wrong, bundle).compare().difference
+    assert difference is not None and (difference.tick, difference.value) == (late[3].index, "plan")
 
 
 def test_a_recording_says_whether_maps_were_predicted(tmp_path, bundle):

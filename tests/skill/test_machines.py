@@ -62,7 +62,7 @@ def test_a_worker_acts_by_the_weights_it_is_given(tmp_path: Path) -> None:
                 value[:2], value[2:] = torch.atanh(torch.tensor(wanted)), -10.0  # the least noise there is: 0.007
         worker.load({key: value.numpy() for key, value in weights.items()})
         worker.begin(config, (0, 0, 0))
-        torch.testing.assert_close(worker.next()["action"], torch.full((2, 64, 2), wanted), atol=0.05, rtol=0.0)
+        torch.testing.assert_close(worker.next()["action"], torch.full((1, 128, 2), wanted), atol=0.05, rtol=0.0)
 
 
 def test_an_error_in_a_worker_is_told_when_it_is_asked_for(tmp_path: Path) -> None:

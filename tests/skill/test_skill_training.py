@@ -104,11 +104,17 @@ def test_a_run_does_all_its_steps_evaluates_and_logs(straight):
     assert straight.learner.updates == 51
 
 
+def test_reasons_for_new_plans_are_logged_but_for_those_that_an_episode_begins_with(straight):
+    logged = [key for key in metrics_of(straight.run.path)[0] if key.startswith("replans/")]
+    assert logged == [f"replans/{reason}" for reason in ("d_update", "half_index", "invalid", "goal", "outdated")]
+
+
 def test_many_simulations_make_segments_longer_than_checkpoints_were_asked_for(tmp_path):
-    trainer = trainer_in(tmp_path / "run", "skill.num_envs=4", "skill.checkpoint_every_steps=8")
+    few = ("skill.checkpoint_every_steps=8", "skill.updates_per_step=0.02")
+    trainer = trainer_in(tmp_path / "run", "skill.num_envs=4", "skill.total_steps=1280", *few)
     trainer.train()
-    # whole batches of 128 steps out of 4 times 150
-    assert [line["step"] for line in metrics_of(tmp_path / "run") if line["stage"] == "skill"] == [512, 768]
+    # whole batches of 128 steps, at least 4 times 150 of them
+    assert [line["step"] for line in metrics_of(tmp_path / "run") if line["stage"] == "skill"] == [640, 1280]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(straight, interrupted):
@@ -217,6 +223,14 @@ def test_a_skill_that_was_never_evaluated_is_refused_with_a_hint(tmp_path):
     assert state["steps"] == 256 and state["best_actor"] is None
     with pytest.raises(RunError, match="train for longer"):
         load_actor(trainer.config, state)
+
+
+def test_for_a_skill_from_elsewhere_no_replay_is_made(tmp_path):
+    run = Run.create(tiny_run.config(tmp_path / "run"))
+    run.save("skill", {"imported": True})
+    with pytest.raises(RunError, match="comes from another run or a bundle: it drives, but cannot be trained on"):
+        SkillTrainer(run.config, run)
+    assert [file.name for file in (run.path / "skill").iterdir()] == ["checkpoint.pt"]
 
 
 def test_a_loss_that_is_not_finite_stops_training_before_it_reaches_the_checkpoint(tmp_path):

@@ -73,7 +73,7 @@ def checkpoint_steps(folder: Path) -> int:
 
 def test_physics_that_breaks_stops_training_and_names_the_episode(trained, at_step, tmp_path):
     layouts: list[Layout] = []
-    two_segments = ("skill.num_envs=4", "skill.total_steps=1024")
+    two_segments = ("skill.num_envs=4", "skill.total_steps=1280")
 
     def break_simulation(trainer: SkillTrainer) -> None:
         layouts.append(trainer.batches.task.layouts[3])
@@ -82,15 +82,15 @@ def test_physics_that_breaks_stops_training_and_names_the_episode(trained, at_st
     at_step(896, break_simulation)
     code, line = trained(*tiny_run.arguments(tmp_path / "run", *two_segments))
     assert code == 1 and line.startswith("hiernav train: the physics of simulation 3 is not finite after step ")
-    assert "at step 896 of training, and the last checkpoint is of step 512" in line
+    assert "at step 896 of training, and the last checkpoint is of step 640" in line
     # what it prints draws the very world it happened in
     named = re.search(r"hiernav world --kind '(\S+)' --seed (\d+) --radius (\S+) --png", line)
     drawn = sample_layout(parse_world(named[1]), int(named[2]), float(named[3]))
     np.testing.assert_array_equal(drawn.pillars, layouts[0].pillars)
     np.testing.assert_array_equal(drawn.start, layouts[0].start)
-    assert checkpoint_steps(tmp_path / "run") == 512
+    assert checkpoint_steps(tmp_path / "run") == 640
     assert trained("--resume", str(tmp_path / "run"))[0] == 0
-    assert checkpoint_steps(tmp_path / "run") == 1024
+    assert checkpoint_steps(tmp_path / "run") == 1280
 
 
 def test_weights_that_break_in_the_last_update_of_a_segment_do_not_reach_the_checkpoint(tmp_path):

@@ -18,12 +18,12 @@ SHARE = 128
 """Transitions that a worker delivers at a time."""
 SETTINGS = (
     "skill.workers=2",
-    "skill.total_steps=768",
+    "skill.total_steps=1024",
     "skill.checkpoint_every_steps=512",
-    "skill.learning_starts=767",
+    "skill.learning_starts=1023",
     "skill.eval_episodes=1",
 )
-"""Two batches in the first segment, one in the second, all of random actions, and updates at the very end."""
+"""Two segments of two batches each, all of random actions, and updates at the very end."""
 
 
 def trainer_in(folder: Path, collector: str, *overrides: str) -> SkillTrainer:
@@ -69,11 +69,12 @@ def check_that_others_lost_nothing(trainer: SkillTrainer, replay: TensorDict) ->
     """Worker 0 is as if nothing had happened; what worker 1 could not deliver came from its successor."""
     config = trainer.config
     undisturbed = shares(config, (0, 0, 0), 2)
+    after = zip(shares(config, (512, 0, 0), 2), shares(config, (512, 1, 1), 2), strict=True)
     expected = [
         *(undisturbed[0], shares(config, (0, 1, 0), 1)[0]),
         *(undisturbed[1], shares(config, (0, 1, 1), 1)[0]),
-        *(shares(config, (512, 0, 0), 1)[0], shares(config, (512, 1, 1), 1)[0]),
+        *(share for both in after for share in both),
     ]
-    assert len(replay) == len(trainer.replay) == 768
+    assert len(replay) == len(trainer.replay) == 1024
     for key in ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done")):
         assert torch.equal(replay[key], torch.cat([share[key] for share in expected])), key
