@@ -336,12 +336,14 @@ class Episodes:
             if self.page is not None:
                 opened.callback(self.page.close)
             self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
+            if self.recorder is not None:
+                opened.callback(self.recorder.close)
+            self.account = Account(kept=KEPT if serves else None, began=clock.now())
+            self.faults = FaultWatch(self.account)
+            self.goals = GoalWatch(self.driver, self.account, self.layout.seed) if serves else None
+            self.granted = {} if arguments.fast else request_realtime(settings.realtime)
+            self.console = _screen(arguments)
             opened.pop_all()
-        self.account = Account(kept=KEPT if serves else None, began=clock.now())
-        self.faults = FaultWatch(self.account)
-        self.goals = GoalWatch(self.driver, self.account, self.layout.seed) if serves else None
-        self.granted = {} if arguments.fast else request_realtime(settings.realtime)
-        self.console = _screen(arguments)
 
     def drive(self) -> int:
         """From start to goal in every world."""
@@ -364,6 +366,7 @@ class Episodes:
                     _complain(" ".join(str(error).split()))
                     break
                 if self.driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people
+                    self.faults.open = None  # by nobody
                     self.driver.supervisor.acknowledge(self.driver.clock.now())
             if self.interrupted:
                 break
@@ -383,7 +386,7 @@ class Episodes:
                 self.driver.serve()
         finally:
             self.goals.close()
-        if not (self.goals.stood or self._at_fault()):
+        if not (self.driver.stopped or self._at_fault()):
             self.faults.open = self.account.add_fault("the robot was not seen to stand", self.driver.clock.now())
 
     def _account_for(self, go: Callable[[list[Drive]], None]) -> int:

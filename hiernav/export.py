@@ -153,7 +153,7 @@ def write_bundle(
             ),
             skill=SkillSpec(inputs=(_spec("observation", golden),), outputs=(_spec("action", golden),)),
             observation=_fields(layout),
-            goselo=GoseloSpec(pixels=goselo.PIXELS, channels=tuple(network.channels), local_side_m=goselo.LOCAL_SIDE),
+            goselo=GoseloSpec(channels=tuple(network.channels), **goselo.constants()),
             plan=PlanSpec(
                 waypoints=option.waypoints,
                 spacing_m=option.spacing_m,

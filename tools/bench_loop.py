@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,8 @@ def measure(
     layout = sample_layout(parse_world(WORLD), 0)
     occupancy = layout.occupancy(0.0)
     link = ProcessPlanner(bundle, 0.1, occupancy.occupied.size)
-    pilot = Pilot(make_agent(bundle, 0.1, planner=link), link)
+    agent = make_agent(bundle, 0.1, planner=link)
+    pilot = Pilot(replace(agent, control_period=robot.control_period), link)  # at other rates than it was trained for
     guard = Guard(2, load_settings([ROOT / "deploy" / "point.yaml"]).guard)
     estimator, config = Estimator(EstimatorConfig(tilts=False)), DriverConfig(max_steps=10**9)
     driver = Driver(

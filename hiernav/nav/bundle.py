@@ -83,11 +83,15 @@ class ObservationField(_Struct, frozen=True):
 
 
 class GoseloSpec(_Struct, frozen=True):
-    """How the planner's images are made."""
+    """How the planner's images are made; defaults are those of bundles that do not say all of it."""
 
     pixels: Size
     channels: tuple[str, ...]
     local_side_m: Length
+    margin_m: Margin = 0.4
+    min_distance_m: Length = 0.1
+    clearance_clip_m: Length = 0.64
+    visit_clip: Size = 4
 
 
 class PlanSpec(_Struct, frozen=True):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,6 +34,18 @@ VISIT_CLIP = 4
 """Entries into a pixel beyond this look the same."""
 CLEARANCE_CLIP = 0.64
 """Clearance that a pixel value of 255 stands for [m]."""
+
+
+def constants() -> dict[str, Any]:
+    """What images are made by besides their channels, as a bundle's `GoseloSpec` names it."""
+    return {
+        "pixels": PIXELS,
+        "local_side_m": LOCAL_SIDE,
+        "margin_m": MARGIN,
+        "min_distance_m": MIN_DISTANCE,
+        "clearance_clip_m": CLEARANCE_CLIP,
+        "visit_clip": VISIT_CLIP,
+    }
 
 
 @dataclass(frozen=True)

@@ -108,8 +108,6 @@ class GoalWatch(Observer):
             seed: of the world it serves in.
         """
         self.driver, self.account, self.seed = driver, account, seed
-        self.stood = True
-        """Whether the robot was seen to stand when it was last looked for."""
         self._ended: Trip | None = None
         self._newest: RunResult | None = None
         self._truth: Truth | None = None
@@ -118,8 +116,6 @@ class GoalWatch(Observer):
     def event(self, event: Event) -> None:
         if event.kind == "end":
             self._ended = self.driver.last_trip
-        elif event.kind == "stop":
-            self.stood = bool(event.values["stands"])
         elif event.kind == "goal" and "x" in event.values:
             self._take_result()
             self._collisions = 0 if self._truth is None else self._truth.collisions
@@ -139,7 +135,7 @@ class GoalWatch(Observer):
         result = self.driver.last_result
         if result is None or result is self._newest or self._ended is None:
             return
-        self._newest, self.stood = result, result.stopped
+        self._newest = result
         self._add(self._ended, result)
 
     def _add(self, trip: Trip, result: RunResult) -> None:

@@ -149,6 +149,8 @@ class Driver:
         """Why the last run ended without anybody's wish: the robot cannot be read any more (`RobotGone`)."""
         self.last_result: RunResult | None = None
         """Of the goal that ended last."""
+        self.stopped = True
+        """Whether the robot was seen to stand at the end of the last run."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
         self._requests: deque[tuple[Ticket, Callable[[float], None]]] = deque()
@@ -298,7 +300,7 @@ class Driver:
             if self._trip is not None:
                 self._end_trip("interrupted", self.clock.now())
             self.audience.tell(lambda observer: observer.flush(FLUSH_SECONDS))
-            stopped = self._stop()
+            self.stopped = stopped = self._stop()
             if stopped:
                 self._stands()
             if self._ended is not None:
@@ -395,7 +397,8 @@ class Driver:
             if fallen is not None and not supervisor.latched:
                 self._fail(fallen, now)
             timer.mark("send")
-            self._check_stop(estimate, now)
+            if not supervisor.driving:  # else one tick was braked, not the robot
+                self._check_stop(estimate, now)
         timer.end()
         self._show(now)
 

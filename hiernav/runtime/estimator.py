@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -79,6 +80,8 @@ class Estimator:
         self._has_position = self._has_yaw = False
         self._unsure = {"position_fix": 0, "magnetometer": 0} if config.confirm else {}
         """Sensors of which no reading agrees with the first one yet, and how many have not."""
+        self._first: dict[str, tuple[Sequence[float], float]] = {}
+        """Their first reading, or the newest that took its place, and its frame's stamp [s]."""
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}
@@ -163,10 +166,10 @@ class Estimator:
                 self.counts["stale_frame"] += 1
                 return False
             self.counts["gap" if step > 0.0 else "clock_restart"] += 1
-            sensors, terms, first = self._watch.sensors, self._heard, True
+            watch, terms, first = self._watch, self._heard, True
             self.reset()
-            for name in sensors:
-                self._watch.expect(name, stamp)
+            self._watch = watch
+            watch.begin_again(stamp)
             self._heard = dict.fromkeys(terms, stamp)
         self._step = 0.0 if first else step
         self._stamp, self._odd = stamp, 0
@@ -261,10 +264,12 @@ class Estimator:
         miss = wrap(yaw - self._filter.yaw)
         if not self._has_yaw:
             self._has_yaw = True
+            self._first["magnetometer"] = field, self._stamp
             self._filter.replace((YAW,), (wrap(yaw),), variance)
         elif self._filter.correct_yaw(miss, variance, self._gate_1):
-            self._unsure.pop("magnetometer", None)
-        elif self._unsure.get("magnetometer") is not None:
+            self._confirm("magnetometer", field, self.config.hold_after)
+        elif "magnetometer" in self._unsure:
+            self._first["magnetometer"] = field, self._stamp
             self._filter.replace((YAW,), (wrap(yaw),), variance)
             if not self._agrees_roughly("magnetometer", (miss,)):
                 return
@@ -298,7 +303,7 @@ class Estimator:
         """Use the fix that this frame shows for the first time, and one that came before its time."""
         if self._early is not None and self._early[0] <= self._stamp + 1e-9:
             (stamp, fix), self._early = self._early, None
-            self._correct_position(fix, stamp)
+            self._correct_position(fix, stamp, shown_again=False)
         if frame.position_fix is None:
             return
         stamp = self._stamp if frame.fix_stamp is None else float(frame.fix_stamp)
@@ -314,9 +319,10 @@ class Estimator:
         if self._early is None and self._stamp + 1e-9 < stamp <= self._stamp + EARLY:
             self._early = stamp, components
         else:
-            self._correct_position(components, stamp)
+            self._correct_position(components, stamp, shown_again=frame.fix_stamp is None)
 
-    def _correct_position(self, fix: list[float], stamp: float) -> None:
+    def _correct_position(self, fix: list[float], stamp: float, shown_again: bool) -> None:
+        """Take in a fix measured at `stamp` [s]; `shown_again`: it may be the last one, under its frame's stamp."""
         if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
             self.counts["stale_fix"] += 1
             return
@@ -332,11 +338,12 @@ class Estimator:
         first, self._has_position = not self._has_position, True
         if not first and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
             self._shift_history(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
-            self._unsure.pop("position_fix", None)
+            self._confirm("position_fix", fix, self.config.fix_hold_after if shown_again else 0.0)
         else:
-            unsure = self._unsure.get("position_fix") is not None
+            unsure = "position_fix" in self._unsure
             if not (first or unsure or self._reject("position_fix", miss)):
                 return
+            self._first["position_fix"] = fix, self._stamp
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)
             if unsure and not first and not self._agrees_roughly("position_fix", miss):
@@ -385,6 +392,13 @@ class Estimator:
         self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
+    def _confirm(self, sensor: str, reading: Sequence[float], patience: float) -> None:
+        """A reading agrees with the first. The same to the bit is that one shown again, unless it stays for long."""
+        if sensor in self._unsure:
+            first, since = self._first[sensor]
+            if reading != first or self._stamp - since >= patience:
+                del self._unsure[sensor]
+
     def _agrees_roughly(self, sensor: str, miss: tuple[float, ...]) -> bool:
         """Whether a reading that took the place of the first one is to be believed, though it does not pass the gate.
 
@@ -392,6 +406,7 @@ class Estimator:
         """
         self.counts[f"{sensor}_rejected"] += 1
         self._unsure[sensor] += 1
+        self._rejected_at[sensor] = self._stamp
         if self._unsure[sensor] < self.config.reinit_after or math.hypot(*miss) > self.config.reinit_spread:
             return False
         del self._unsure[sensor]
@@ -404,7 +419,8 @@ class Estimator:
     def _may_yet_be_believed(self, sensor: str) -> bool:
         """Whether a sensor speaks, is rejected, and has not had as many measurements as would be believed after all."""
         speaks = self._stamp - self._rejected_at.get(sensor, -math.inf) < self.config.hold_after
-        return speaks and 0 < self._rejected[sensor] < self._patience(sensor)
+        unsure = 0 < self._unsure.get(sensor, 0) < self.config.reinit_after
+        return speaks and (unsure or 0 < self._rejected[sensor] < self._patience(sensor))
 
     def _trust(self) -> tuple[Trust, str]:
         """What the estimate is good for, judged by the sensor that has been silent for too long."""

@@ -49,11 +49,14 @@ class SensorWatch:
         """
         self._sigma = dict(sigma)
         self._sensors: dict[str, _Sensor] = {}
+        self._thawed = -math.inf
+        """When sensors that had all repeated themselves began to change again [s]."""
 
-    @property
-    def sensors(self) -> list[str]:
-        """Those that the robot has, as far as is known."""
-        return list(self._sensors)
+    def begin_again(self, stamp: float) -> None:
+        """The robot's clock is another one from `stamp` [s] on: forget all readings, not which sensors repeat them."""
+        for name, sensor in self._sensors.items():
+            self._sensors[name] = _Sensor(sensor.sigma, (), stamp, stamp, repeats_itself=sensor.repeats_itself)
+        self._thawed = -math.inf
 
     def expect(self, name: str, stamp: float) -> None:
         """The robot has this sensor, whatever it says: it counts as silent from `stamp` [s] on until it is heard of."""
@@ -68,12 +71,13 @@ class SensorWatch:
         if sensor is None or not sensor.value:
             since = stamp if sensor is None else sensor.believed
             new = _Sensor(self._sigma[name], value, since, stamp, stir_from=value, leap_from=value)
+            new.repeats_itself = sensor is not None and sensor.repeats_itself
             self._sensors[name] = new
             return
         if value == sensor.value:
             sensor.repeats += 1
             return
-        if sensor.repeats >= REPEATS and not self._hung(name, sensor):
+        if sensor.repeats >= REPEATS and not self._hung(name, sensor, stamp):
             sensor.repeats_itself = True
         sensor.changes += 1
         sensor.repeats = 0
@@ -107,11 +111,13 @@ class SensorWatch:
             return True
         return any(sensor.value) and self._all_repeat(sensor.new)
 
-    def _hung(self, name: str, sensor: _Sensor) -> bool:
-        """Whether a sensor that repeated itself and now does not any more should not have."""
+    def _hung(self, name: str, sensor: _Sensor, stamp: float) -> bool:
+        """Whether a sensor that repeated itself and does not any more, from `stamp` [s] on, should not have."""
         if sensor.changes < LEARN:
             return False
-        return self._others_moved(name, sensor.new, STIR) or self._all_repeat(sensor.new)
+        if self._all_repeat(sensor.new):
+            self._thawed = stamp  # the others follow in this frame
+        return self._thawed == stamp or self._others_moved(name, sensor.new, STIR)
 
     def _all_repeat(self, since: float) -> bool:
         """Whether nothing has been new since then, and that of several sensors which never repeated themselves before:

@@ -147,6 +147,8 @@ class FixedRateLoop:
     def _prepare_for(self, deadline: float) -> None:
         assert self._prepare is not None
         began = self.clock.now()
+        if began > deadline:  # woken too late, by no fault of the preparation
+            return
         self._prepare(False)
         first = self.clock.now()
         self._spoilt = self._spoilt + 1 if first > deadline else 0

@@ -132,12 +132,11 @@ def load_policies(bundle: Bundle) -> Policies:
 
 def _require_images(spec: GoseloSpec) -> None:
     """BundleError unless the planner is shown the images that it was trained on."""
-    if spec.pixels != goselo.PIXELS:
-        raise BundleError(f"goselo.pixels: {spec.pixels} in the bundle, {goselo.PIXELS} in the runtime")
-    if not abs(spec.local_side_m - goselo.LOCAL_SIDE) <= 1e-9:
-        raise BundleError(
-            f"goselo.local_side_m: {spec.local_side_m:g} m in the bundle, {goselo.LOCAL_SIDE:g} m in the runtime"
-        )
+    for name, ours in goselo.constants().items():
+        theirs = getattr(spec, name)
+        if not abs(theirs - ours) <= 1e-9:
+            unit = " m" if name.endswith("_m") else ""
+            raise BundleError(f"goselo.{name}: {theirs:g}{unit} in the bundle, {ours:g}{unit} in the runtime")
     try:
         goselo.check_channels(spec.channels)
     except ValueError as error:

@@ -359,3 +359,20 @@ def test_a_preparation_that_keeps_making_ticks_late_is_dropped(caplog):
     loop.run()
     assert prepared[0] == SPOILT and "preparing takes 30.0 ms" in caplog.text
     assert late[SPOILT] > 0.009 and not any(late[SPOILT + 1 :])
+
+
+def test_a_loop_that_is_woken_too_late_to_prepare_blames_itself(caplog):
+    class Sleepy(FakeClock):
+        def sleep_until(self, when: float) -> None:
+            super().sleep_until(when)
+            self.advance(0.03)
+
+    clock, ticks = Sleepy(), [0]
+
+    def tick(now: float) -> bool:
+        ticks[0] += 1
+        return ticks[0] == 50
+
+    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=lambda again: None, lead=0.02)
+    loop.run()
+    assert "dropped" not in caplog.text

@@ -142,7 +142,7 @@ MUTANTS = (
            f"{F}/test_04_spikes.py"),
     Mutant("sensors that all hang", f"{R}/freshness.py", "return any(sensor.value) and self._all_repeat(sensor.new)",
            "return False", f"{F}/test_02_frozen_value.py"),
-    Mutant("sensors that hang again", f"{R}/freshness.py", "STIR) or self._all_repeat(sensor.new)", "STIR)",
+    Mutant("sensors that hang again", f"{R}/freshness.py", "self._thawed = stamp  #", "pass  #",
            f"{F}/test_02_frozen_value.py"),
     Mutant("frozen fix", f"{R}/estimator.py", 'if self._watch.repetition("position_fix", stamp) >=',
            'if False and self._watch.repetition("position_fix", stamp) >=', f"{F}/test_02_frozen_value.py"),

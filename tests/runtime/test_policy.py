@@ -149,6 +149,10 @@ def test_a_planner_that_answers_in_another_type_is_refused():
     ("part", "field", "wrong", "message"),
     [
         ("goselo", "local_side_m", 7.0, r"goselo.local_side_m: 7 m in the bundle, 3.2 m in the runtime"),
+        ("goselo", "margin_m", 0.5, r"goselo.margin_m: 0.5 m in the bundle, 0.4 m in the runtime"),
+        ("goselo", "min_distance_m", 0.2, r"goselo.min_distance_m: 0.2 m in the bundle, 0.1 m in the runtime"),
+        ("goselo", "clearance_clip_m", 0.6, r"goselo.clearance_clip_m: 0.6 m in the bundle, 0.64 m in the runtime"),
+        ("goselo", "visit_clip", 5, r"goselo.visit_clip: 5 in the bundle, 4 in the runtime"),
         ("goselo", "pixels", 128, "goselo.pixels: 128 in the bundle, 64 in the runtime"),
         ("goselo", "channels", ["a"], "number of goselo.channels: 3 in the network, 1 in the manifest"),
         ("goselo", "channels", [], "number of goselo.channels: 3 in the network, 0 in the manifest"),

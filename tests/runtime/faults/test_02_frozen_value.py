@@ -9,6 +9,7 @@ import pytest
 from runtime_motion import estimator_for, follow, frames, recorded
 
 from hiernav.runtime.estimator import Trust
+from hiernav.runtime.freshness import SensorWatch
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 
 BEGIN = 1.5
@@ -113,3 +114,20 @@ def test_wheel_encoders_that_say_zero_at_rest_are_not_frozen():
 
     errors = follow(rest, estimator_for(motion), frames(rest), encoders)
     assert all(each.trust is Trust.GOOD for each in errors.estimates)
+
+
+def test_coarse_sensors_are_known_for_it_also_after_the_clock_has_started_again():
+    """They repeat themselves at rest, all of them, and that is no reason not to drive."""
+    watch = SensorWatch({"gyro": 0.02, "accelerometer": 0.1})
+
+    def see(count: int, begin: float, moves: bool) -> None:
+        for k in range(count):
+            for name in ("gyro", "accelerometer"):
+                watch.see(name, (1.0 + 0.5 * (k + 1) * moves, 0.0, 0.0), begin + 0.02 * k)
+
+    see(10, 0.0, moves=False)
+    see(20, 1.0, moves=True)
+    watch.begin_again(0.0)
+    see(20, 0.1, moves=True)
+    see(20, 1.0, moves=False)
+    assert not watch.frozen("gyro") and not watch.frozen("accelerometer")

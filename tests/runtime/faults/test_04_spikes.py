@@ -61,6 +61,32 @@ def test_a_spike_among_the_first_readings_is_not_driven_on(robot, sensor, which)
     assert errors.position[good].max() < 0.15 and np.abs(errors.yaw[good]).max() < 0.3
 
 
+@pytest.mark.parametrize("sensor", ["position_fix", "magnetometer"])
+def test_a_first_spike_that_is_shown_again_and_again_does_not_confirm_itself(sensor):
+    """An adapter at 50 Hz that shows what sensors of 10 Hz said last, under the stamp of each frame."""
+    motion, shown = recorded("point"), {}
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        if not shown:
+            spike = frame.position_fix + [3.0, -0.3], frame.magnetometer[[1, 0, 2]] * [-1.0, 1.0, 1.0]
+            shown.update({sensor: spike[sensor == "magnetometer"]})
+        elif round(frame.stamp / motion.stamps[1]) % 5 == 0:
+            shown[sensor] = getattr(frame, sensor)
+        return replace(frame, **shown, fix_stamp=None)
+
+    errors = follow(motion, estimator_for(motion), frames(motion), damage, confirmed=False)
+    good = np.array([each.trust is Trust.GOOD for each in errors.estimates])
+    assert good.mean() > 0.75 and not good[:5].any() and good[-1]
+    assert errors.position[good].max() < 0.2 and np.abs(errors.yaw[good]).max() < 0.4
+
+
+def test_a_first_reading_that_others_do_not_fit_is_waited_for_not_lost():
+    motion = recorded("doggo")
+    errors = follow(motion, estimator_for(motion, magnetometer_sigma=1e-4), frames(motion), confirmed=False)
+    trusts = [each.trust for each in errors.estimates]
+    assert Trust.GOOD in trusts and Trust.LOST not in trusts[: trusts.index(Trust.GOOD)]
+
+
 def test_sensors_that_are_noisier_than_was_said_are_believed_after_all():
     motion = recorded("point")
     estimator = estimator_for(motion, fix_sigma=1e-4)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from puck import GOAL, Listener, Puck, driver_of, follow, pilot_for
+from puck import GOAL, Listener, Puck, Scripted, driver_of, follow, pilot_for
 
 from hiernav.nav.planners import StraightPlanner
 
@@ -41,3 +41,15 @@ def test_the_third_is_a_fault_in_its_own_tick(value):
     assert result.reason == "fault" and "action not finite 3 times in a row, first in channel 1" in result.fault
     assert seen.records[-1].index == 5 and seen.records[-1].sent is None
     assert np.isfinite(robot.sent).all()
+
+
+def test_a_tick_that_is_braked_long_after_a_wait_is_not_taken_for_a_robot_that_does_not_stop():
+    def script(step: int, straight: np.ndarray) -> np.ndarray:
+        if step in (3, 5):
+            (driver.pause if step == 3 else driver.resume)()
+        return 0.2 * straight * (math.nan if step == 50 else 1.0)
+
+    driver = driver_of(Puck(noise=1e-3), Scripted(script))
+    result = driver.run(GOAL)
+    assert result.reached and result.guard["non_finite"] == 1 and result.holds == {"paused": 1}
+    assert result.seconds > 5.0

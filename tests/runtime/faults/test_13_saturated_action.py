@@ -48,5 +48,10 @@ def test_less_than_nine_tenths_are_no_reason():
 
 def test_recoveries_that_do_not_help_end_in_a_fault():
     seen, result = drive(share=1.0, lasting=1e9, turning=12.0)
-    assert result.reason == "fault" and "stays saturated, 3 recoveries did not help" in result.fault
+    assert result.reason == "fault" and "recoveries in this place did not help" in result.fault
     assert result.recoveries >= 3
+
+
+def test_so_do_those_that_are_never_twice_in_one_place():
+    seen, result = drive(share=1.0, lasting=1e9, turning=2.0)
+    assert result.reason == "fault" and "stays saturated, 3 recoveries did not help" in result.fault

@@ -38,7 +38,7 @@ def drive(degrees: float):
     robot, seen = Puck(control_period=PERIOD, noise=1e-3, sees=rolling_over(degrees)), Listener()
     pilot = Scripted(lambda step, straight: 0.2 * straight)
     guard = Guard(2, GuardConfig(tilt_limit=LIMIT))
-    driver = driver_of(robot, pilot, estimator=Estimator(EstimatorConfig()), guard=guard, observers=[seen])
+    driver = driver_of(robot, pilot, estimator=Estimator(EstimatorConfig(confirm=False)), guard=guard, observers=[seen])
     return robot, seen, driver.run(GOAL, max_steps=400)
 
 
@@ -62,7 +62,8 @@ def test_a_robot_that_falls_while_it_is_braked_is_a_fault_too(paused):
     """Whether it has no goal yet, or waits on its way to one."""
     seen, robot = Listener(), Puck(control_period=PERIOD, noise=1e-3, sees=rolling_over(180.0))
     guard = Guard(2, GuardConfig(tilt_limit=LIMIT))
-    driver = driver_of(robot, Scripted(), estimator=Estimator(EstimatorConfig()), guard=guard, observers=[seen])
+    estimator = Estimator(EstimatorConfig(confirm=False))
+    driver = driver_of(robot, Scripted(), estimator=estimator, guard=guard, observers=[seen])
 
     class Operator(Listener):
         def tick(self, record):
