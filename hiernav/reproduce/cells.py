@@ -81,6 +81,17 @@ def cell_key(cell: Cell, places: Places) -> str:
     return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def training_hash(cell: Cell, places: Places) -> str | None:
+    """Of what the run folder that drives says of its trainings, for a cell that drives one; None where it is not here.
+
+    Another training of the same configuration is another robot: no two end after the same time.
+    """
+    if cell.run is None or cell.kind == "train":
+        return None
+    summary = places.runs / cell.run / "summary.json"
+    return file_sha256(summary)[:16] if summary.is_file() else None
+
+
 def bundle_hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of what decides how a bundle drives; empty where there is no bundle."""
     names = (MANIFEST, PLANNER, SKILL)

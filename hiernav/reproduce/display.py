@@ -44,7 +44,7 @@ def print_cells(console: Console, entries: Sequence[Entry], estimate: Estimates)
         table.add_column(column, justify="right" if column == "takes" else "left", no_wrap=column != "note")
     for entry in entries:
         took = entry.result.seconds if entry.state in ("done", "failed") and entry.result else estimate(entry.cell)
-        note = entry.error or ("of other settings or another bundle" if entry.state == "changed" else "")
+        note = entry.error or ("of other settings, another bundle or training" if entry.state == "changed" else "")
         color = _COLORS[entry.state]
         table.add_row(entry.cell.id, f"[{color}]{entry.state}[/]", duration(took), escape(note))
     console.print(table)

@@ -13,7 +13,7 @@ from typing import Literal
 
 import msgspec
 
-from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key
+from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key, training_hash
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
 from hiernav.reproduce.results import (
@@ -31,7 +31,7 @@ from hiernav.reproduce.work import Outcome, Report, is_trained_here, trained_sec
 from hiernav.run import RunError
 
 State = Literal["open", "done", "failed", "changed", "damaged"]
-"""`changed`: there is a result, of other settings or of another bundle, and the cell is run again."""
+"""`changed`: there is a result, of other settings, another bundle or another training, and the cell is run again."""
 Execute = Callable[[Cell, Places, Report, Code], Outcome]
 
 
@@ -109,6 +109,9 @@ def look_up(cell: Cell, places: Places) -> Entry:
     if result is None:
         return Entry(cell, "open")
     if result.key != cell_key(cell, places):
+        return Entry(cell, "changed", result)
+    drove, trained = result.source.get("trained"), training_hash(cell, places)
+    if drove is not None and trained is not None and drove != trained:
         return Entry(cell, "changed", result)
     film = result.metrics.get("file")
     if film and not (places.results / "films" / film).exists():

@@ -20,7 +20,7 @@ from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, 
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
 from hiernav.planner import passes
-from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key
+from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key, training_hash
 from hiernav.reproduce.experiments import differences
 from hiernav.reproduce.results import Code
 from hiernav.run import spent_seconds
@@ -202,7 +202,7 @@ def _policies(cell: Cell, places: Places) -> tuple[Path, dict[str, Any]]:
         folder = places.root / cell.bundle
         return folder, {"bundle": cell.bundle, "sha256": bundle_hashes(folder)}
     assert cell.run is not None, cell.id
-    return places.runs / cell.run, {"run": cell.run}
+    return places.runs / cell.run, {"run": cell.run, "trained": training_hash(cell, places)}
 
 
 def _evaluate(cell: Cell, places: Places, report: Report) -> Outcome:

@@ -14,7 +14,7 @@ import pytest
 
 from hiernav.finetune import DEFAULTS
 from hiernav.planner import passes
-from hiernav.reproduce.cells import Cell, Places, cell_key
+from hiernav.reproduce.cells import Cell, Places, cell_key, training_hash
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
@@ -86,7 +86,7 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(places):
     work = Work()
     queue = Queue(cells, places, work)
     assert [entry.state for entry in queue.entries()] == ["failed", "open", "done"]
-    queue.run()
+    assert queue.run().failed == {"astar/a": "ValueError: no such world (before; --retry-failed runs it again)"}
     assert work.calls == [], "a failed cell was run again unasked"
     queue.run(retry=True)
     assert work.calls == ["a", "b"]
@@ -108,6 +108,23 @@ def test_what_drives_a_training_that_was_made_elsewhere_waits_for_its_run_folder
     assert queue.run().skipped.keys() == {drive.id}, "a training that is half way here was driven"
     (places.runs / "t-0" / "summary.json").write_text('{"skill": {}}')
     assert queue.run().done == [drive.id]
+
+
+def test_what_drove_a_training_drives_again_once_it_was_trained_anew(places):
+    drive, folder = cell("d", run="t-0"), places.runs / "t-0"
+    (folder / "skill").mkdir(parents=True)
+    (folder / "summary.json").write_text('{"skill": {"seconds": 1.0}}')
+
+    def execute(each, where, report, code):
+        return Outcome({"strict": DRIVE}, {"run": each.run, "trained": training_hash(each, where)}, each.settings)
+
+    assert Queue([drive], places, execute).run().done == [drive.id]
+    assert look_up(drive, places).state == "done"
+    (folder / "summary.json").write_text('{"skill": {"seconds": 2.0}}')
+    assert look_up(drive, places).state == "changed"
+    assert Queue([drive], places, execute).run().done == [drive.id]
+    shutil.rmtree(folder)
+    assert look_up(drive, places).state == "done", "where it was trained elsewhere its result is all there is"
 
 
 def test_no_cell_is_started_that_does_not_fit_into_the_budget(places):
