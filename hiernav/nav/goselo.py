@@ -114,7 +114,7 @@ def images(
         for channel, (source, crop) in enumerate(plan):
             out[row, channel] = _crop(
                 levels[source],
-                visits[row] if source == "visits" else occupancy[row],
+                occupancy[row],
                 (x, y) if crop == "local" else middle,
                 up,
                 _SIDES[crop](length),
@@ -175,23 +175,23 @@ def _halve(level: np.ndarray, outside: int) -> list[np.ndarray]:
 
 def _crop(
     levels: list[np.ndarray],
-    grid: OccupancyMap | VisitMap,
+    occupancy: OccupancyMap,
     center: Sequence[float],
     up: Sequence[float],
     side: float,
     outside: int,
 ) -> np.ndarray:
-    """A square of `side` [m] of a grid around `center`, turned so that `up` points to the top: (64, 64) uint8."""
+    """A square of `side` [m] around `center`, turned so that `up` points to the top: (64, 64) uint8."""
     pixel = side / PIXELS
-    depth = min(max(int(math.log2(pixel / grid.resolution) + 1e-9), 0), len(levels) - 1)
-    step = grid.resolution * 2**depth
+    depth = min(max(int(math.log2(pixel / occupancy.resolution) + 1e-9), 0), len(levels) - 1)
+    step = occupancy.resolution * 2**depth
     # per pixel and axis, so that none of the level is skipped
     samples = min(max(1, math.ceil(pixel / step - 1e-6)), _MOST_SAMPLES)
     count, fine = PIXELS * samples, pixel / samples
     (ux, uy), half = up, 0.5 * (side - fine)
     # right is (uy, -ux); the first sample is the upper left one
-    x = (center[0] + half * (ux - uy) - grid.origin[0]) / step - 0.5
-    y = (center[1] + half * (uy + ux) - grid.origin[1]) / step - 0.5
+    x = (center[0] + half * (ux - uy) - occupancy.origin[0]) / step - 0.5
+    y = (center[1] + half * (uy + ux) - occupancy.origin[1]) / step - 0.5
     scale = fine / step
     image = cv2.warpAffine(
         levels[depth],

@@ -447,12 +447,9 @@ class HierarchicalAgent:
     layout: ObservationLayout
     control_period: float
     """Time between two calls of `act` [s]."""
-    axis: float = 0.0
-    """Bearing in the body frame that the robot drives along best [rad]; for `Recovery`."""
 
     def __post_init__(self) -> None:
-        option = self.option
-        self.recovery = Recovery(option.num_rows, self.control_period, option.sweep_radius, axis=self.axis)
+        self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
         self._clocked = "clock" in self.layout.names
 

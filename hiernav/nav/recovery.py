@@ -16,8 +16,6 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.path import distances, polyline
 from hiernav.nav.sweep import sweep
 
-DRIVE_AXES = {"car": 0.5 * np.pi}
-"""Bearing in the body frame that a robot drives along best, forward or backward [rad], where it is not 0."""
 _LEAST_FREE = 2
 """Waypoints of a way out that must be free for it to be tried before those that are blocked at once."""
 _DIMMED = 0.7
@@ -56,15 +54,10 @@ class Recovery:
         reach_m: float = 0.5,
         limit: int = 3,
         clear_m: float = 0.5,
-        axis: float = 0.0,
     ) -> None:
-        """
-        Args:
-            radius: of the disc that must fit on the way out [m].
-            axis: bearing in the body frame that the robot drives along best, forward or backward [rad].
-        """
+        """`radius` is that of the disc that must fit on the way out [m]."""
         self.radius, self.least_m, self.reach_m, self.limit, self.clear_m = radius, least_m, reach_m, limit, clear_m
-        self.ways, self.axis = ways, axis
+        self.ways = ways
         self._try = max(1, round(try_s / control_period))
         self._window = max(1, round(window_s / control_period))
         self._trail = np.full((num_rows, max(self._window, round(patience_s / control_period)), 2), np.nan)
@@ -186,8 +179,7 @@ class Recovery:
 
     def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
         first = int(self._tries[row]) * self.ways  # go on where the last recovery in this place ended
-        along = pose + [0.0, 0.0, self.axis]
-        self._bearings[row] = np.roll(_ranked_ways(along, plan, occupancy, self.radius)[0], -first)
+        self._bearings[row] = np.roll(_ranked_ways(pose, plan, occupancy, self.radius)[0], -first)
         self._spacing[row], self._ways_left[row] = _spacing(pose, plan), self.ways
         self._turn(row, pose[:2], len(plan), occupancy)
         self._began[row], self._trail[row] = pose[:2], np.nan
@@ -237,7 +229,7 @@ def ways_out(pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius
     """Straight plans away from a robot, each up to the first waypoint that is not free to come to and padded there.
 
     Args:
-        pose: (3,) world frame [m, m, rad], its third number the direction that the robot drives in best.
+        pose: (3,) world frame [m, m, rad].
         plan: (K, 2) to be left, world frame [m]; the ways out have as many waypoints, as far apart.
         occupancy: map as it is now.
         radius: of the disc that is swept along them [m].

@@ -92,8 +92,8 @@ BASELINE = [
     "skill.preset=baseline", "skill.reward_scale=1.0",
     "reward.time=0", "reward.tilt=-3", "reward.leave_field=-60", "reward.fall=-60",
 ]  # fmt: skip
-"""Its rewards are as large as ours after scaling: every step costs the distance to the goal, and an early end more than
-the steps it spares. What a robot's file says of them is meant for ours."""
+"""Its rewards are as large as ours after scaling: every step costs the distance to the goal, and an early end 60. What
+a robot's file says of them is meant for ours."""
 
 
 def table2_updates(samples: int) -> int:

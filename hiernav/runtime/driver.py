@@ -166,7 +166,7 @@ class Driver:
 
     def _require_fit(self) -> None:
         trained, period = self.pilot.control_period, self.robot.control_period
-        if trained is not None and not math.isclose(trained, period, rel_tol=1e-6):
+        if not math.isclose(trained, period, rel_tol=1e-6):
             raise ValueError(f"Driver: the policies act every {trained:g} s, the robot every {period:g} s")
         if self.guard.action_dim != self.robot.action_dim:
             raise ValueError(
@@ -537,14 +537,6 @@ class Driver:
         """Past the guard to the robot; what was sent, None if the robot is to be braked, and how it was slowed."""
         x, y, _ = estimate.pose.tolist()
         vx, vy = estimate.velocity.tolist()
-        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.action):
-            self._saturation.reset()
-            self._saturated += 1
-            if self._saturated > MAX_SATURATED:
-                self.guard.braked(estimate.upright)
-                self._fail(f"the action stays saturated, {MAX_SATURATED} recoveries did not help", now)
-                return None, 1.0
-            self.pilot.recover()
         slow = self.guard.config.slow_ttc
         ttc = math.inf
         if slow is not None:
@@ -556,6 +548,13 @@ class Driver:
             self._fail(guarded.fault, now)
         if guarded.brake or guarded.fault is not None:
             return None, guarded.scale
+        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.action):
+            self._saturation.reset()
+            self._saturated += 1
+            if self._saturated > MAX_SATURATED:
+                self._fail(f"the action stays saturated, {MAX_SATURATED} recoveries did not help", now)
+                return None, guarded.scale
+            self.pilot.recover()
         sent = self.robot.send(guarded.action)
         self.timer.mark("send")
         if self._trip is not None:

@@ -124,7 +124,7 @@ class SensorWatch:
         whatever reads them hangs, and shows under fresh stamps what it read last."""
         repeating = [s for s in self._sensors.values() if s.repeats >= REPEATS and s.changes >= LEARN]
         return (
-            sum(not sensor.repeats_itself for sensor in repeating) > 1
+            len(repeating) > 1
             and not any(sensor.repeats_itself for sensor in repeating)
             and all(sensor.new <= since for sensor in self._sensors.values())
         )

@@ -134,8 +134,8 @@ class Pilot:
         self.reset()
 
     @property
-    def control_period(self) -> float | None:
-        """Time between two calls of `act` that the policies are for [s]; None if any will do."""
+    def control_period(self) -> float:
+        """Time between two calls of `act` that the policies are for [s]."""
         return self.agent.control_period
 
     @property

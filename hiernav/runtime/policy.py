@@ -12,7 +12,6 @@ from hiernav.nav import goselo
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, TensorSpec
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
-from hiernav.nav.recovery import DRIVE_AXES
 from hiernav.runtime.robot import Robot
 
 GOLDEN_TOLERANCE = 1e-5
@@ -203,8 +202,7 @@ def make_agent(
         refresh=refresh_steps(bundle.manifest.control_period_s),
         predict=predict,
     )
-    axis = DRIVE_AXES.get(bundle.manifest.robot, 0.0)
-    return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s, axis)
+    return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s)
 
 
 def check_golden(bundle: Bundle, policies: Policies | None = None) -> dict[str, float]:

@@ -18,18 +18,15 @@ SHOWN, SHOWN_FAULTS = 100, 10
 """Episodes and faults on the screen, the newest."""
 
 
-def summarise(
-    episodes: Account | Sequence[Episode], timer: TickTimer, loop: FixedRateLoop, realtime: Mapping[str, str]
-) -> dict[str, Any]:
+def summarise(account: Account, timer: TickTimer, loop: FixedRateLoop, realtime: Mapping[str, str]) -> dict[str, Any]:
     """Everything worth knowing about the runs, in JSON's own types; times in seconds.
 
     Args:
-        episodes: the runs, in order, or an account of them.
+        account: of the runs.
         timer: of the ticks of all runs.
         loop: that paced them.
         realtime: what the system granted (`request_realtime`).
     """
-    account = episodes if isinstance(episodes, Account) else Account(episodes)
     return {
         "episodes": [_episode(episode) for episode in account.episodes],
         "ends": dict(account.ends),

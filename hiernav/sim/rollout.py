@@ -9,7 +9,7 @@ import numpy as np
 
 from hiernav.nav.option import Skill, TerminationReason
 from hiernav.nav.path import arc_lengths
-from hiernav.nav.recovery import DRIVE_AXES, Recovery
+from hiernav.nav.recovery import Recovery
 from hiernav.nav.search import PathField
 from hiernav.sim.layout import GOAL_RADIUS, Layout
 from hiernav.sim.task import NavigationTask, TaskStep
@@ -78,11 +78,9 @@ def run_episodes(
     current[:rows] = np.arange(rows)
     waiting = rows
     guided = "waypoints" in task.layout.names
-    task.recovery = None
-    if recover and guided:
-        robot = task.robot
-        axis = DRIVE_AXES.get(robot.name, 0.0)
-        task.recovery = Recovery(task.num_rows, robot.control_period, robot.radius, axis=axis)
+    task.recovery = (
+        Recovery(task.num_rows, task.robot.control_period, task.robot.radius) if recover and guided else None
+    )
     # rows without an episode of their own repeat one and are not looked at
     task.reset(layouts=[layouts[row % rows] for row in range(task.num_rows)])
     driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))

@@ -271,14 +271,6 @@ def test_the_next_recovery_in_one_place_begins_where_the_last_one_ended() -> Non
     assert seen[::TRY] == [0, 180, 90, -90, 45, -45, 135, -135, 0, 180, 90, -90]
 
 
-def test_a_robot_that_drives_along_another_axis_tries_that_one_first() -> None:
-    recovery, seen = Recovery(1, PERIOD, axis=np.pi / 2), []
-    for _ in range(WINDOW + DURATION):
-        followed = recovery(np.array([[0.0, 0.0, -np.pi / 2]]), AHEAD[..., ::-1] * [1.0, -1.0], [FREE])
-        seen += bearings([followed[0]]) if recovery.active.any() else []
-    assert sorted(seen[::TRY][:2]) == [0, 180] and sorted(seen[::TRY][2:4]) == [-90, 90]
-
-
 def test_a_way_out_ends_where_the_map_is_not_free() -> None:
     walled = empty_map((3.0, 3.0))
     draw_discs(walled.occupied, walled.origin, walled.resolution, np.array([[0.75, 0.0]]), 0.2)

@@ -93,6 +93,7 @@ class Scripted:
     plan_counts: Mapping[str, int] = field(default_factory=dict)
     recoveries: int = 0
     control_period: float | None = None
+    """None: that of the robot it is given to (`driver_of`)."""
 
     def reset(self) -> None:
         self.steps = 0
@@ -146,10 +147,12 @@ def driver_of(
     clock: FakeClock | None = None,
     **settings: object,
 ) -> Driver:
-    field_map = empty_map((2.0, 2.0))
+    field_map, robot, pilot = empty_map((2.0, 2.0)), robot or Puck(), pilot or Scripted()
+    if isinstance(pilot, Scripted) and pilot.control_period is None:
+        pilot.control_period = robot.control_period
     settings.setdefault("estimator", Estimator(EstimatorConfig(tilts=False, confirm=False)))
     known = occupancy or (lambda stamp: field_map)
-    return Driver(robot or Puck(), pilot or Scripted(), known, clock or FakeClock(), **settings)  # type: ignore[arg-type]
+    return Driver(robot, pilot, known, clock or FakeClock(), **settings)  # type: ignore[arg-type]
 
 
 LAYOUT = ObservationLayout((ObservationTerm("waypoints", 20, "m, body frame", 1.0),))

@@ -13,6 +13,7 @@ from puck import GOAL, PERIOD, Listener, Puck, Scripted, driver_of
 from rich.console import Console
 
 from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
+from hiernav.runtime.account import Account, Episode
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimator, EstimatorConfig
@@ -20,7 +21,7 @@ from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.observe import Observer, TickRecord
 from hiernav.runtime.robot import RobotGone, SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
-from hiernav.runtime.summary import Episode, print_summary, summarise
+from hiernav.runtime.summary import print_summary, summarise
 from hiernav.runtime.supervisor import InvalidTransition, Mode
 from hiernav.runtime.terms import TermHold
 from hiernav.runtime.trip import RunResult
@@ -481,7 +482,9 @@ def test_a_missing_or_broken_reading_keeps_its_last_good_value():
 def test_the_summary_is_json_and_readable():
     driver = driver_of()
     result = driver.run(GOAL)
-    summary = summarise([Episode(3, result, collisions=0)], driver.timer, driver.loop, {"timer_slack": "granted"})
+    summary = summarise(
+        Account([Episode(3, result, collisions=0)]), driver.timer, driver.loop, {"timer_slack": "granted"}
+    )
     again = json.loads(json.dumps(summary, allow_nan=False))
     assert again == summary
     episode = summary["episodes"][0]
@@ -499,7 +502,7 @@ def test_the_summary_is_json_and_readable():
 
 def test_a_summary_without_a_position_is_json_too():
     driver = driver_of(Puck(sees=lambda frame: replace(frame, position_fix=None)))
-    summary = summarise([Episode(None, driver.run(GOAL))], driver.timer, driver.loop, {})
+    summary = summarise(Account([Episode(None, driver.run(GOAL))]), driver.timer, driver.loop, {})
     assert json.loads(json.dumps(summary, allow_nan=False))["episodes"][0]["distance"] is None
     print_summary(summary, Console(file=io.StringIO()))
 
@@ -517,7 +520,7 @@ def test_a_simulated_point_robot_drives_to_its_goal_on_noisy_sensors():
         turn = math.remainder(math.atan2(straight[1], straight[0]) - pilot.yaw, 2 * math.pi)
         return np.array([0.3 * (math.cos(turn) > 0.9), np.clip(2.0 * turn, -1.0, 1.0)])
 
-    pilot = Steering(steer)
+    pilot = Steering(steer, control_period=robot.control_period)
     driver = Driver(
         robot, pilot, robot.occupancy, FakeClock(), Estimator(EstimatorConfig(tilts=False)), Guard(robot.action_dim)
     )
