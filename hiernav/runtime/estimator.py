@@ -40,6 +40,16 @@ _SAMPLED = _Accuracy(0.3, (0.3, 3.0))
 _INTEGRATED = _Accuracy(0.05, (1.0, 10.0))
 
 
+class _First(NamedTuple):
+    """A first reading, or the newest that took its place."""
+
+    reading: Sequence[float]
+    stamp: float
+    """Of its frame [s]."""
+    others: int
+    """Readings so far that did not agree with the one before."""
+
+
 class Estimator:
     """Planar state estimator: predicts at the control rate, corrects with whatever passes its gate."""
 
@@ -78,10 +88,8 @@ class Estimator:
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
-        self._unsure = {"position_fix": 0, "magnetometer": 0} if config.confirm else {}
-        """Sensors of which no reading agrees with the first one yet, and how many have not."""
-        self._first: dict[str, tuple[Sequence[float], float]] = {}
-        """Their first reading, or the newest that took its place, and its frame's stamp [s]."""
+        self._unsure: dict[str, _First] = {}
+        """By sensor, the first reading of those of which no other agrees with it yet."""
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}
@@ -264,14 +272,13 @@ class Estimator:
         miss = wrap(yaw - self._filter.yaw)
         if not self._has_yaw:
             self._has_yaw = True
-            self._first["magnetometer"] = field, self._stamp
+            self._doubt("magnetometer", field)
             self._filter.replace((YAW,), (wrap(yaw),), variance)
         elif self._filter.correct_yaw(miss, variance, self._gate_1):
             self._confirm("magnetometer", field, self.config.hold_after)
         elif "magnetometer" in self._unsure:
-            self._first["magnetometer"] = field, self._stamp
             self._filter.replace((YAW,), (wrap(yaw),), variance)
-            if not self._agrees_roughly("magnetometer", (miss,)):
+            if not self._agrees_roughly("magnetometer", field, (miss,)):
                 return
         elif self._reject("magnetometer", (miss,)):
             self._filter.replace((YAW,), (wrap(yaw),), variance)
@@ -343,10 +350,11 @@ class Estimator:
             unsure = "position_fix" in self._unsure
             if not (first or unsure or self._reject("position_fix", miss)):
                 return
-            self._first["position_fix"] = fix, self._stamp
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._shift_history(-math.inf, *miss)
-            if unsure and not first and not self._agrees_roughly("position_fix", miss):
+            if first:
+                self._doubt("position_fix", fix)
+            elif unsure and not self._agrees_roughly("position_fix", fix, miss):
                 return
         self._accept("position_fix", stamp)
 
@@ -392,22 +400,27 @@ class Estimator:
         self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
+    def _doubt(self, sensor: str, reading: Sequence[float], others: int = 0) -> None:
+        """Drive on no reading that may be a spike, before another agrees with it."""
+        if self.config.confirm:
+            self._unsure[sensor] = _First(reading, self._stamp, others)
+
     def _confirm(self, sensor: str, reading: Sequence[float], patience: float) -> None:
         """A reading agrees with the first. The same to the bit is that one shown again, unless it stays for long."""
-        if sensor in self._unsure:
-            first, since = self._first[sensor]
-            if reading != first or self._stamp - since >= patience:
-                del self._unsure[sensor]
+        first = self._unsure.get(sensor)
+        if first is not None and (reading != first.reading or self._stamp - first.stamp >= patience):
+            del self._unsure[sensor]
 
-    def _agrees_roughly(self, sensor: str, miss: tuple[float, ...]) -> bool:
-        """Whether a reading that took the place of the first one is to be believed, though it does not pass the gate.
+    def _agrees_roughly(self, sensor: str, reading: Sequence[float], miss: tuple[float, ...]) -> bool:
+        """Whether a reading that takes the place of the first one is to be believed, though it does not pass the gate.
 
         Only where many others did not either: then the sensor is noisier than it is said to be.
         """
+        others = self._unsure[sensor].others + 1
         self.counts[f"{sensor}_rejected"] += 1
-        self._unsure[sensor] += 1
         self._rejected_at[sensor] = self._stamp
-        if self._unsure[sensor] < self.config.reinit_after or math.hypot(*miss) > self.config.reinit_spread:
+        if others < self.config.reinit_after or math.hypot(*miss) > self.config.reinit_spread:
+            self._doubt(sensor, reading, others)
             return False
         del self._unsure[sensor]
         return True
@@ -419,7 +432,7 @@ class Estimator:
     def _may_yet_be_believed(self, sensor: str) -> bool:
         """Whether a sensor speaks, is rejected, and has not had as many measurements as would be believed after all."""
         speaks = self._stamp - self._rejected_at.get(sensor, -math.inf) < self.config.hold_after
-        unsure = 0 < self._unsure.get(sensor, 0) < self.config.reinit_after
+        unsure = sensor in self._unsure and self._unsure[sensor].others < self.config.reinit_after
         return speaks and (unsure or 0 < self._rejected[sensor] < self._patience(sensor))
 
     def _trust(self) -> tuple[Trust, str]:

@@ -139,7 +139,7 @@ MUTANTS = (
     Mutant("map after a gap", PREDICTION, "not (0.0 < gap <= GAP_S and", "not (True and", P),
     Mutant("same map again", f"{R}/driver.py", "or not occupancy.shows_the_same_as(before):", "or True:",
            f"{T}/test_driver.py"),
-    Mutant("first reading", f"{R}/estimator.py", "if config.confirm else {}", "if False else {}",
+    Mutant("first reading", f"{R}/estimator.py", "if self.config.confirm:", "if False:",
            f"{F}/test_04_spikes.py"),
     Mutant("sensors that all hang", f"{R}/freshness.py", "return any(sensor.value) and self._all_repeat(sensor.new)",
            "return False", f"{F}/test_02_frozen_value.py"),
