@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
-from hiernav.runtime.freshness import SensorWatch
+from hiernav.runtime.freshness import SensorWatch, TermWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
 from hiernav.runtime.robot import ABSURD, VECTOR_SENSORS, SensorFrame
-from hiernav.runtime.terms import is_sound
 from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
 __all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
@@ -23,6 +22,8 @@ MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
 EARLY = 0.1
 """A fix measured up to this long after the inertial sensors of its frame is kept until they have caught up [s]."""
+AT_REST = 0.05
+"""Slower than this is not counted as travelling: it may be noise [m/s]."""
 JUMP_AFTER, RESTART_AFTER = 2, 10
 """Frames in a row that must agree on another time before it is believed: a later one, and an earlier one."""
 
@@ -97,7 +98,9 @@ class Estimator:
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
-        self._heard: dict[str, float] = {}
+        self._terms = TermWatch()
+        self._travelled = (0.0, 0.0)
+        """By dead reckoning [m]."""
         self._flaws: dict[str, str] = {}
 
     @property
@@ -113,8 +116,6 @@ class Estimator:
 
     def silence(self, sensor: str) -> float:
         """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
-        if sensor in self._heard:
-            return self._stamp - self._heard[sensor]
         return self._watch.silence(sensor, self._stamp)
 
     def update(self, frame: SensorFrame) -> Estimate | None:
@@ -142,12 +143,10 @@ class Estimator:
 
     def _listen(self, frame: SensorFrame) -> None:
         """Note which of the sensors that only the skill needs say something that it can use: lidar and robot's own."""
-        heard, stamp = self._heard, self._stamp
-        if frame.lidar is not None and (is_sound("lidar", frame.lidar) or "lidar" not in heard):
-            heard["lidar"] = stamp
+        if frame.lidar is not None:
+            self._terms.see("lidar", frame.lidar, self._stamp, self._travelled)
         for name, value in frame.extra.items():
-            if is_sound(name, value) or name not in heard:
-                heard[name] = stamp
+            self._terms.see(name, value, self._stamp, self._travelled)
 
     def _read(self, name: str, value: np.ndarray | None) -> Vector | None:
         """A sensor's reading, unless it is missing, garbage, or frozen for too long to be believed."""
@@ -174,11 +173,11 @@ class Estimator:
                 self.counts["stale_frame"] += 1
                 return False
             self.counts["gap" if step > 0.0 else "clock_restart"] += 1
-            watch, terms, first = self._watch, self._heard, True
+            watch, terms, first = self._watch, self._terms, True
             self.reset()
-            self._watch = watch
+            self._watch, self._terms = watch, terms
             watch.begin_again(stamp)
-            self._heard = dict.fromkeys(terms, stamp)
+            terms.begin_again(stamp)
         self._step = 0.0 if first else step
         self._stamp, self._odd = stamp, 0
         return True
@@ -231,7 +230,11 @@ class Estimator:
         if dt > 0.0:
             mean_yaw_rate = (mean[1] * uy + mean[2] * uz) / level
             variance = config.yaw_walk**2 * dt + (config.gyro_sigma * dt) ** 2 + (0.5 * change * dt) ** 2
+            x, y, _, ahead, aside, _ = self._filter.x
             self._filter.predict_motion(dt, mean_yaw_rate, math.sqrt(variance))
+            if math.hypot(ahead, aside) > AT_REST:
+                dx, dy = self._filter.x[X] - x, self._filter.x[Y] - y
+                self._travelled = self._travelled[0] + dx, self._travelled[1] + dy
         self._rate = rate
 
     def _measured_rate(self, rate: Vector | None) -> tuple[Vector, float]:
@@ -448,8 +451,7 @@ class Estimator:
             if trust > worst:
                 flaw = self._flaws.get(name)
                 worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
-        for name, heard in self._heard.items():
-            silence = self._stamp - heard
+        for name, silence in self._terms.silences(self._stamp):
             if silence < self.config.hold_after:
                 continue
             trust = Trust.LOST if silence >= self.config.lost_after else Trust.HOLD

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+
+import numpy as np
+
+from hiernav.runtime.terms import is_sound
 
 Reading = tuple[float, ...]
 
@@ -14,6 +18,8 @@ LEARN = 10
 """Readings without repetition after which a sensor is known to be noisy."""
 REPEATS = 3
 """Repetitions in a row, while nothing else changes either, that a noisy sensor never shows."""
+TRAVEL = 0.05
+"""A way that changes whatever lidar and joints read, unless they read nothing at all [m]."""
 
 
 @dataclass
@@ -134,3 +140,64 @@ class SensorWatch:
             if other != name and (sensor.stirred if size == STIR else sensor.leapt) > since:
                 return True
         return False
+
+
+@dataclass
+class _Term:
+    heard: float
+    """When it last said something that the skill can use [s]."""
+    reading: bytes = b""
+    """The last one, to the bit."""
+    new: float = -math.inf
+    """When that was first said [s]..."""
+    place: tuple[float, float] = (0.0, 0.0)
+    """...and where [m]."""
+    changes: int = 0
+    repeats_itself: bool = False
+
+
+class TermWatch:
+    """Remembers when each sensor that only the skill needs last said something that it can use: lidar, robot's own.
+
+    They may be without noise, and say the same for as long as the robot stands. One that has changed often enough and
+    then repeats itself to the bit while the robot travels is frozen, unless it reads nothing but zeros, as a lidar does
+    where nothing is near. One that travels so before it has changed often, a gripper say, is not judged.
+    """
+
+    def __init__(self) -> None:
+        self._terms: dict[str, _Term] = {}
+
+    def begin_again(self, stamp: float) -> None:
+        """The robot's clock is another one from `stamp` [s] on: forget all readings, not which sensors repeat them."""
+        for name, term in self._terms.items():
+            self._terms[name] = _Term(stamp, repeats_itself=term.repeats_itself)
+
+    def see(self, name: str, value: np.ndarray, stamp: float, place: tuple[float, float]) -> None:
+        """Take note of a reading at `stamp` [s].
+
+        Args:
+            name: of the sensor.
+            value: of any shape.
+            stamp: of its frame [s].
+            place: where dead reckoning has the robot, from wherever it began [m].
+        """
+        term = self._terms.get(name)
+        if term is None:
+            term = self._terms[name] = _Term(stamp)
+        if not is_sound(name, value):
+            return
+        reading = np.asarray(value).tobytes()
+        if reading != term.reading:
+            term.reading, term.new, term.place = reading, stamp, place
+            term.changes += 1
+        elif not term.repeats_itself and any(reading) and math.dist(place, term.place) > TRAVEL:
+            if term.changes > LEARN:
+                term.heard = min(term.heard, term.new)
+                return
+            term.repeats_itself = True
+        term.heard = stamp
+
+    def silences(self, stamp: float) -> Iterator[tuple[str, float]]:
+        """Each sensor, and for how long it has said nothing that can be used [s]."""
+        for name, term in self._terms.items():
+            yield name, stamp - term.heard

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from runtime_motion import estimator_for, follow, frames, recorded
+from runtime_motion import Motion, estimator_for, follow, frames, recorded
 
 from hiernav.runtime.estimator import Trust
-from hiernav.runtime.freshness import SensorWatch
+from hiernav.runtime.freshness import SensorWatch, TermWatch
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 
 BEGIN = 1.5
@@ -131,3 +132,57 @@ def test_coarse_sensors_are_known_for_it_also_after_the_clock_has_started_again(
     see(20, 0.1, moves=True)
     see(20, 1.0, moves=False)
     assert not watch.frozen("gyro") and not watch.frozen("accelerometer")
+
+
+def skill_sensors(motion: Motion, begin: float, quiet: bool = False) -> Callable[[SensorFrame], SensorFrame]:
+    """A lidar's and a gripper's readings on the way, the lidar frozen from `begin` on, or `quiet`: nothing is near."""
+    last: list[np.ndarray] = [np.full(10, 0.5)]
+    corners = np.stack([np.cos(np.arange(10)), np.sin(np.arange(10))], axis=1)
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        if frame.stamp < begin:
+            place = motion.poses[np.searchsorted(motion.stamps, frame.stamp), :2]
+            last[0] = np.exp(-np.linalg.norm(place - corners, axis=1))
+        gripper = np.full(2, 0.3 if frame.stamp < 2.0 else frame.stamp)
+        return replace(frame, lidar=last[0] * (not quiet), extra={"gripper": gripper})
+
+    return damage
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_a_frozen_lidar_asks_to_hold_soon_after_the_robot_has_moved(robot):
+    motion = recorded(robot)
+    begin = np.searchsorted(motion.stamps, BEGIN)
+    way = np.linalg.norm(motion.poses[begin:, :2] - motion.poses[begin, :2], axis=1)
+    moved = motion.stamps[begin + np.flatnonzero(way > 0.1)[0]]
+    errors = follow(motion, estimator_for(motion), frames(motion), skill_sensors(motion, BEGIN))
+    held = next(each for each in errors.estimates if each.trust is not Trust.GOOD)
+    assert BEGIN < held.stamp <= max(moved, BEGIN + 0.4)
+    assert held.why.startswith("lidar says nothing usable")
+    assert errors.estimates[-1].trust is Trust.LOST
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_lidar_that_reads_nothing_and_a_gripper_that_is_seldom_used_are_not_frozen(robot, quiet):
+    motion = recorded(robot)
+    errors = follow(motion, estimator_for(motion), frames(motion), skill_sensors(motion, 99.0, quiet))
+    assert all(each.trust is Trust.GOOD for each in errors.estimates)
+
+
+def test_a_lidar_that_thaws_is_trusted_again_and_watched_further():
+    watch, place = TermWatch(), 0.0
+
+    def silence(stamp: float, reading: float) -> float:
+        watch.see("lidar", np.full(10, reading), stamp, (place, 0.0))
+        return dict(watch.silences(stamp))["lidar"]
+
+    for k in range(20):
+        assert silence(0.1 * k, 0.01 * k) == 0.0
+    for begin in (2.0, 3.0):
+        assert silence(begin, 0.5 / begin) == 0.0
+        place += 0.2
+        assert silence(begin + 0.5, 0.5 / begin) == pytest.approx(0.5)
+        assert silence(begin + 0.6, 0.6) == 0.0
+    watch.begin_again(0.0)
+    assert dict(watch.silences(0.3)) == {"lidar": 0.3}
