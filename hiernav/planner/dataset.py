@@ -24,7 +24,7 @@ from hiernav.planner.mix import WorldMix
 from hiernav.run import WorkersLost
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
-from hiernav.sim.worlds import sample_layout
+from hiernav.sim.worlds import WorldError, sample_layout
 
 T = TypeVar("T")
 
@@ -32,6 +32,8 @@ _CLEARANCE = "clearance_local"
 _WORLDS_PER_TASK = 8
 _MIN_CLEARANCE = 0.03
 """Starts keep at least this far from obstacles [m]: a robot in contact is about there."""
+_MAX_TRIES = 200
+"""Starts tried for each sample of a world, on average."""
 _OFF_PATH = 0.1
 """Standard deviation of starts around the path [m]."""
 
@@ -168,7 +170,7 @@ def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], proc
 
 
 def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:
-    """`count` samples of one world."""
+    """`count` samples of one world; WorldError if a path leads to the goal from hardly anywhere."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, 0x1ABE1)))
     layout = sample_layout(spec, seed, settings.radius)
     occupancy = layout.occupancy(0.0)
@@ -176,7 +178,15 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
     starts: list[np.ndarray] = []
     labels: list[np.ndarray] = []
     visits: list[VisitMap] = []
+    tries = 0
     while len(starts) < count:
+        tries += 1
+        if tries > _MAX_TRIES * count:
+            raise WorldError(
+                f"world {spec}, seed {seed}: {len(starts)} of {tries - 1} starts have a path to the goal "
+                f"{layout.goal.round(2).tolist()} for a disc of {settings.radius:g} m; use a map with more room, or a "
+                "smaller planner.planning_radius_m"
+            )
         start, seen = _random_start(occupancy, rng), VisitMap(occupancy)
         if len(starts) % 2:
             path = field.waypoints(start, 80, 0.05)

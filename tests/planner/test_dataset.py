@@ -14,7 +14,7 @@ from hiernav.planner import dataset
 from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples, map_tasks
 from hiernav.run import WorkersLost
 from hiernav.sim.layout import parse_world
-from hiernav.sim.worlds import Layout, sample_layout
+from hiernav.sim.worlds import Layout, WorldError, sample_layout
 
 RADIUS = 0.1
 SETTINGS = LabelSettings(worlds=("pillar(1.5,1.5,5)",), radius=RADIUS, soft_margin=0.1, samples_per_world=8)
@@ -169,6 +169,14 @@ def test_every_start_is_among_the_visits_as_it_is_when_a_robot_plans(monkeypatch
         assert np.array_equal(seen.counts, before), "the robot is there"
     assert [int(seen.counts.sum()) for seen, _ in shown[::2]] == [1] * 8
     assert np.median([int(seen.counts.sum()) for seen, _ in shown[1::2]]) > 2
+
+
+def test_a_world_whose_goal_hardly_a_path_leads_to_is_an_error_and_no_endless_search(monkeypatch):
+    layout = sample_layout(SPEC, 5, 0.1)
+    monkeypatch.setattr(dataset, "sample_layout", lambda *_: layout)
+    wide = replace(SETTINGS, radius=1.5)
+    with pytest.raises(WorldError, match=r"seed 5: 0 of 400 starts have a path to the goal .* for a disc of 1.5 m"):
+        label_world(wide, SPEC, 5, 2)
 
 
 def test_labels_avoid_the_same_obstacles_that_the_images_show(drawn):
