@@ -43,7 +43,6 @@ from rich.console import Console
 from hiernav import __version__
 from hiernav.decode import ConfigError
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.runtime.account import KEPT, Account, Episode, FaultWatch, GoalWatch
 from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
@@ -548,7 +547,7 @@ def _open_bundle(path: Path, spec: RobotSpec) -> Bundle:
     """Load a bundle and refuse it unless it fits this robot."""
     bundle = load_bundle(path)
     bundle.require_robot(spec.name, file_sha256(spec.xml_path))
-    bundle.require_layout(observation_layout(spec.name, clock="clock" in bundle.layout.names))
+    bundle.require_layout(spec.observation_layout(clock="clock" in bundle.layout.names))
     bundle.require_resolution(RESOLUTION)
     return bundle
 

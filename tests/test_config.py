@@ -25,8 +25,8 @@ from hiernav.config import (
     dump_config,
     load_config,
 )
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import WaypointOption
+from hiernav.sim.robots import get_robot
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 SECTIONS = {"planner": PlannerConfig, "skill": SkillConfig, "option": OptionConfig, "reward": RewardConfig}
@@ -301,7 +301,7 @@ def test_what_comes_to_nothing_does_not_keep_an_older_run_from_being_read(tmp_pa
 
 
 def test_a_skill_observes_as_many_waypoints_as_plans_must_have_and_a_baseline_none() -> None:
-    terms = {term.name: term.size for term in observation_layout("point").terms}
+    terms = {term.name: term.size for term in get_robot("point").observation_layout().terms}
     assert terms["waypoints"] == 2 * OptionConfig().waypoints
     assert load_config(None, ["skill.preset=baseline", "option.waypoints=12"]).option.waypoints == 12
 

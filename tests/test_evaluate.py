@@ -24,7 +24,6 @@ from hiernav.evaluate import (
     wilson_interval,
 )
 from hiernav.nav.bundle import MANIFEST, BundleError
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import TerminationReason
 from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
 from hiernav.run import RunError
@@ -39,7 +38,7 @@ REASONS = [reason.name.lower() for reason in TerminationReason if reason]
 
 def turn_and_drive(observation: np.ndarray) -> np.ndarray:
     """A skill whose rows are computed apart, to the last bit: turns to the fifth waypoint, drives when it is ahead."""
-    first = observation_layout("point").slices["waypoints"].start + 8
+    first = get_robot("point").observation_layout().slices["waypoints"].start + 8
     ahead, left = observation[:, first], observation[:, first + 1]
     return np.stack([np.clip(10.0 * ahead - 4.0 * np.abs(left), -1.0, 1.0), np.clip(8.0 * left, -1.0, 1.0)], axis=-1)
 

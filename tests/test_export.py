@@ -17,7 +17,6 @@ from hiernav import export  # noqa: E402
 from hiernav.evaluate import Policies, make_planner, open_policies  # noqa: E402
 from hiernav.export import export_run, record_inputs  # noqa: E402
 from hiernav.nav.bundle import HASHED_FILES, MANIFEST, BundleError, file_sha256, load_bundle  # noqa: E402
-from hiernav.nav.observation import observation_layout  # noqa: E402
 from hiernav.nav.option import Planner, PlanQuery  # noqa: E402
 from hiernav.planner.train import load_network  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
@@ -141,14 +140,14 @@ def test_the_manifest_holds_what_the_networks_assume(able_bundle, able_run):
     assert manifest.replan.d_update_m == config.option.d_update_m
     assert manifest.plan.planning_radius_m == robot.radius
     assert manifest.plan.soft_margin_m == config.planner.soft_margin_m
-    assert load_bundle(able_bundle).layout == observation_layout("point")
+    assert load_bundle(able_bundle).layout == get_robot("point").observation_layout()
     assert manifest.provenance["skill_steps"] == 768 and manifest.provenance["seed"] == 3
 
 
 def test_the_papers_planner_and_another_robot_are_exported_too(doggo_bundle):
     loaded, robot = load_bundle(doggo_bundle), get_robot("doggo")
     loaded.require_robot("doggo", file_sha256(robot.xml_path))
-    loaded.require_layout(observation_layout("doggo"))
+    loaded.require_layout(get_robot("doggo").observation_layout())
     assert loaded.manifest.planner.preset == "paper" and loaded.manifest.planner.channels == 6
     assert max(check_golden(loaded).values()) <= 1e-5
     agent = make_agent(loaded, robot.radius)

@@ -20,11 +20,11 @@ def bench_update(arguments: argparse.Namespace) -> dict[str, Any]:
     from sac_peers import ACTIONS, BATCH, torch_transitions
     from tensordict import TensorDict
 
-    from hiernav.nav.observation import observation_layout
+    from hiernav.sim.robots import get_robot
     from hiernav.skill.sac import Learner, SacSettings
 
     torch.set_num_threads(arguments.threads)
-    layout, hidden = observation_layout("doggo"), (arguments.hidden, arguments.hidden)
+    layout, hidden = get_robot("doggo").observation_layout(), (arguments.hidden, arguments.hidden)
     batch = TensorDict(torch_transitions(BATCH), [BATCH])
     learners = {
         precision: Learner(layout, ACTIONS, SacSettings(hidden, precision=precision))

@@ -43,12 +43,12 @@ def hiernav(hidden: int, device: str, precision: str = "auto") -> Burst:
     from tensordict import TensorDict
 
     from hiernav.device import Recorded
-    from hiernav.nav.observation import observation_layout
+    from hiernav.sim.robots import get_robot
     from hiernav.skill.replay import Replay
     from hiernav.skill.sac import Learner, SacSettings
 
     settings = SacSettings(hidden=(hidden, hidden), precision=precision)
-    learner = Learner(observation_layout("doggo"), ACTIONS, settings, device)
+    learner = Learner(get_robot("doggo").observation_layout(), ACTIONS, settings, device)
     folder = tempfile.mkdtemp(prefix="hiernav-bench-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     replay = Replay(Path(folder) / "replay", STORED, OBSERVATION, ACTIONS, BATCH, device)
@@ -67,9 +67,9 @@ def plain(hidden: int, device: str) -> Burst:
     import torch
     from plain_sac import PlainSac
 
-    from hiernav.nav.observation import observation_layout
+    from hiernav.sim.robots import get_robot
 
-    learner = PlainSac(observation_layout("doggo"), ACTIONS, (hidden, hidden), device)
+    learner = PlainSac(get_robot("doggo").observation_layout(), ACTIONS, (hidden, hidden), device)
     stored = torch_transitions(device=device)
 
     def sample() -> dict[str, Any]:

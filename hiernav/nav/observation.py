@@ -6,7 +6,7 @@ inside the network, so a robot never has to know it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,35 +77,23 @@ _GOAL = ObservationTerm("goal", 2, "m, body frame", 0.5)
 CLOCK_HZ = 3.0
 """Frequency of the gait clock: about that of the fastest gaits of the quadruped under open-loop sinusoids."""
 _CLOCK = ObservationTerm("clock", 2, f"sine and cosine of {CLOCK_HZ:g} Hz", 1.0)
-_EXTRA: dict[str, tuple[ObservationTerm, ...]] = {
-    "point": (),
-    "car": (
-        ObservationTerm("rear_rotation", 9, "rotation matrix", 1.0),
-        ObservationTerm("rear_velocity", 3, "rad/s", 0.1),
-    ),
-    "doggo": (
-        ObservationTerm("joint_sin", 12, "", 1.0),
-        ObservationTerm("joint_cos", 12, "", 1.0),
-        ObservationTerm("joint_velocity", 12, "rad/s", 0.1),
-    ),
-}
 
 
-def observation_layout(robot: str, guidance: str = "waypoints", clock: bool = False) -> ObservationLayout:
+def observation_layout(
+    own: Sequence[ObservationTerm], guidance: str = "waypoints", clock: bool = False
+) -> ObservationLayout:
     """The layout of a robot's skill.
 
     Args:
-        robot: "point", "car" or "doggo".
+        own: terms that only this robot has (`RobotSpec.own_terms`).
         guidance: "waypoints" (path-conditioned) or "goal" (the paper's baseline).
         clock: whether the skill sees a gait clock (beyond the paper). A gait is periodic: with the clock it is a
             function of the observation, and no pose of the robot is one that its mean action holds for ever.
     """
-    if robot not in _EXTRA:
-        raise ValueError(f"unknown robot {robot!r}; known: {', '.join(_EXTRA)}")
     if guidance not in ("waypoints", "goal"):
         raise ValueError(f"unknown guidance {guidance!r}; known: waypoints, goal")
     guide = _WAYPOINTS if guidance == "waypoints" else _GOAL
-    return ObservationLayout((*_BASE, guide, *_EXTRA[robot], *((_CLOCK,) if clock else ())))
+    return ObservationLayout((*_BASE, guide, *own, *((_CLOCK,) if clock else ())))
 
 
 def clock_phase(time: np.ndarray) -> np.ndarray:

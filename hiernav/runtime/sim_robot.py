@@ -174,8 +174,8 @@ class SimRobot:
         if readings["gyro"] is not None:
             readings["gyro"] = readings["gyro"] + noise.gyro_bias
         extra = {
-            name: sim.sensors[name][0] + noise.extra * self._rng.standard_normal(size)
-            for name, size in self.spec.extra_terms.items()
+            term.name: sim.sensors[term.name][0] + noise.extra * self._rng.standard_normal(term.size)
+            for term in self.spec.own_terms
         }
         fix, fix_stamp = self._sense_position(now)
         return SensorFrame(

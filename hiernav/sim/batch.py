@@ -29,7 +29,7 @@ class BatchSim:
         upright (N,): z component of the body's z axis, 1 when it stands.
         collided (N,) bool: the robot touched an obstacle in any substep of the last control step.
         sensors: name -> (N, d). accelerometer, velocimeter, gyro and magnetometer (3 each, body frame) and the robot's
-            `extra_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that
+            `own_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that
             substep's start; everything else is of the present state.
         time (N,): since the row's reset [s].
         finite (N,) bool: False where the physics has diverged. Such a row reads NaN and stands still until it is reset.

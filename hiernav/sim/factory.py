@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hiernav.config import ConfigError, TrainConfig
-from hiernav.nav.observation import ObservationLayout, observation_layout
+from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.option import Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
 from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
@@ -102,7 +102,7 @@ def make_task(
 def skill_layout(config: TrainConfig) -> ObservationLayout:
     """Observation layout of a configuration's skill."""
     guidance = "goal" if config.skill.preset == "baseline" else "waypoints"
-    return observation_layout(config.robot, guidance, config.skill.clock)
+    return get_robot(config.robot).observation_layout(guidance, config.skill.clock)
 
 
 def replan_rule(config: TrainConfig) -> ReplanRule:

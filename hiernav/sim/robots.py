@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hiernav.nav.frames import wrap_angle
+from hiernav.nav.observation import ObservationLayout, ObservationTerm, observation_layout
 
 if TYPE_CHECKING:  # who only asks what a robot is like, such as a control loop, needs no physics
     import mujoco
@@ -59,14 +60,26 @@ class RobotSpec:
         return self.timestep * self.substeps
 
     @property
-    def extra_terms(self) -> dict[str, int]:
-        """Name and size of the observation terms that only this robot has, in observation order."""
-        terms: dict[str, int] = {}
+    def own_terms(self) -> tuple[ObservationTerm, ...]:
+        """The observation terms that only this robot has."""
+        terms: tuple[ObservationTerm, ...] = ()
         if self.observed_ball is not None:
-            terms |= {f"{self.observed_ball}_rotation": 9, f"{self.observed_ball}_velocity": 3}
+            terms += (
+                ObservationTerm(f"{self.observed_ball}_rotation", 9, "rotation matrix", 1.0),
+                ObservationTerm(f"{self.observed_ball}_velocity", 3, "rad/s", 0.1),
+            )
         if self.observed_hinges:
-            terms |= {f"joint_{kind}": len(self.observed_hinges) for kind in ("sin", "cos", "velocity")}
+            count = len(self.observed_hinges)
+            terms += (
+                ObservationTerm("joint_sin", count, "", 1.0),
+                ObservationTerm("joint_cos", count, "", 1.0),
+                ObservationTerm("joint_velocity", count, "rad/s", 0.1),
+            )
         return terms
+
+    def observation_layout(self, guidance: str = "waypoints", clock: bool = False) -> ObservationLayout:
+        """What the skill of this robot observes; see `hiernav.nav.observation.observation_layout`."""
+        return observation_layout(self.own_terms, guidance, clock)
 
     def place(self, qpos: np.ndarray, pose: np.ndarray) -> None:
         """Write the start at `pose` (3,) = x, y, yaw into `qpos` (nq,) in place; the other joints are left alone."""
@@ -118,7 +131,7 @@ class JointReader:
             self._ball_qvel = slice(ball.dofadr[0], ball.dofadr[0] + 3)
 
     def read(self, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, np.ndarray]:
-        """(N, nq), (N, nv) -> the terms of `RobotSpec.extra_terms`, each (N, size) and a new array.
+        """(N, nq), (N, nv) -> the terms of `RobotSpec.own_terms`, each (N, size) and a new array.
 
         Rotations are matrices in row-major order, from the joint's frame to its parent's; rates are in rad/s.
         """

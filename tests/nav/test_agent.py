@@ -8,9 +8,9 @@ from nav_planners import map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.frames import body_to_world
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.option import HierarchicalAgent, TerminationReason, WaypointOption
 from hiernav.nav.planners import StraightPlanner
+from hiernav.sim.robots import get_robot
 
 NONE, START = TerminationReason.NONE, TerminationReason.START
 FREE = map_with_pillars()
@@ -22,7 +22,7 @@ PERIOD = 0.1
 
 @pytest.mark.parametrize("guidance", ["waypoints", "goal"])
 def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guidance: str) -> None:
-    layout = observation_layout("point", guidance)
+    layout = get_robot("point").observation_layout(guidance)
     sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
     agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: np.tanh(o[:, :2]), layout, PERIOD)
     goal = np.array([[2.0, 0.0], [0.0, 2.0]])
@@ -42,7 +42,7 @@ def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guida
 
 
 def test_an_agent_that_is_reset_plans_again() -> None:
-    layout = observation_layout("point")
+    layout = get_robot("point").observation_layout()
     sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms}
     agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 1), lambda o: o[:, :2], layout, PERIOD)
     reasons = []
@@ -53,7 +53,7 @@ def test_an_agent_that_is_reset_plans_again() -> None:
 
 
 def test_the_gait_clock_starts_with_each_episode_and_runs_at_three_hertz() -> None:
-    layout = observation_layout("doggo", clock=True)
+    layout = get_robot("doggo").observation_layout(clock=True)
     sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
     agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: o[:, :12], layout, PERIOD)
 

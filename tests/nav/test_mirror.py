@@ -10,7 +10,7 @@ import pytest
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.observation import CLOCK_HZ, clock_phase, observation_layout
+from hiernav.nav.observation import CLOCK_HZ, clock_phase
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
@@ -29,7 +29,7 @@ def twin(layout, flip):
 @pytest.mark.parametrize("guidance", ["waypoints", "goal"])
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
 def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidance: str) -> None:
-    spec, layout = get_robot(robot), observation_layout(robot, guidance, clock=True)
+    spec, layout = get_robot(robot), get_robot(robot).observation_layout(guidance, clock=True)
     mirror = mirror_of(robot, layout)
     # a mirror in the world's x-z plane, or for the car in its y-z plane, turns yaw into -yaw
     flip = np.array([-1.0, 1.0]) if robot == "car" else np.array([1.0, -1.0])
@@ -64,7 +64,7 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
 
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
 def test_mirroring_twice_changes_nothing(robot: str) -> None:
-    layout = observation_layout(robot)
+    layout = get_robot(robot).observation_layout()
     mirror = mirror_of(robot, layout)
     seen = np.random.default_rng(0).normal(size=(5, layout.size)).astype(np.float32)
     action = np.random.default_rng(1).normal(size=(5, len(mirror.action_index)))
@@ -74,4 +74,4 @@ def test_mirroring_twice_changes_nothing(robot: str) -> None:
 
 def test_an_unknown_robot_has_no_mirror() -> None:
     with pytest.raises(ValueError, match="hovercraft"):
-        mirror_of("hovercraft", observation_layout("point"))
+        mirror_of("hovercraft", get_robot("point").observation_layout())

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from hiernav.nav.observation import observation_layout
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, draw_discs, empty_map
 from hiernav.nav.option import HierarchicalAgent, PlanQuery, WaypointOption
 from hiernav.nav.recovery import Recovery, ways_out
+from hiernav.sim.robots import get_robot
 
 PERIOD = 0.1
 WINDOW, TRY, WAYS = 15, 5, 6
@@ -156,7 +156,7 @@ def test_the_end_of_a_recovery_is_told_once_and_asks_for_another_plan() -> None:
             return query.position[:, None] + AHEAD
 
     agent = HierarchicalAgent(
-        WaypointOption(Asked(), 1), lambda o: np.zeros((1, 2)), observation_layout("point"), PERIOD
+        WaypointOption(Asked(), 1), lambda o: np.zeros((1, 2)), get_robot("point").observation_layout(), PERIOD
     )
     sensors = {name: np.zeros((1, size)) for name, size in SENSORS.items()}
     for _ in range(WINDOW + DURATION + 3):

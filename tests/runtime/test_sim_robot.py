@@ -23,8 +23,8 @@ def test_a_frame_has_every_sensor_of_the_robot(name):
     robot = simulated(name)
     frame = robot.read()
     terms = frame.terms()
-    assert set(terms) == {*VECTOR_SENSORS, "lidar", *robot.spec.extra_terms}
-    assert all(terms[term].shape == (size,) for term, size in robot.spec.extra_terms.items())
+    assert set(terms) == {*VECTOR_SENSORS, "lidar", *(term.name for term in robot.spec.own_terms)}
+    assert all(terms[term.name].shape == (term.size,) for term in robot.spec.own_terms)
     assert terms["lidar"].shape == (10,) and terms["lidar"].max() > 0.0
     assert frame.position_fix.shape == (2,)
 

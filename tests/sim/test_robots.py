@@ -72,7 +72,7 @@ def test_robot_has_the_sizes_of_the_paper(name, actions, extra, period):
     robot = get_robot(name)
     model = build_model(robot, SceneSpec())
     assert robot.action_dim == actions == model.nu
-    assert sum(robot.extra_terms.values()) == extra
+    assert sum(term.size for term in robot.own_terms) == extra
     assert robot.control_period == pytest.approx(period)
     assert model.opt.timestep == robot.timestep
 
@@ -150,9 +150,9 @@ def test_every_extra_term_is_read_with_its_declared_size():
     for robot in ROBOTS.values():
         model = build_model(robot, SceneSpec())
         terms = JointReader(robot, model).read(np.tile(model.qpos0, (3, 1)), np.zeros((3, model.nv)))
-        assert {name: value.shape for name, value in terms.items()} == {
-            name: (3, size) for name, size in robot.extra_terms.items()
-        }
+        assert [(name, value.shape) for name, value in terms.items()] == [
+            (term.name, (3, term.size)) for term in robot.own_terms
+        ]
 
 
 def test_unknown_robot_is_refused_with_the_known_names():

@@ -10,13 +10,13 @@ from scenery import layout_of
 from small_tasks import WORLD
 
 from hiernav.config import TrainConfig
-from hiernav.nav.observation import observation_layout
 from hiernav.sim.factory import make_task
 from hiernav.sim.layout import GOAL_RADIUS, Layout
+from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes, shortest_length
 from hiernav.sim.worlds import sample_layout
 
-WAYPOINTS = observation_layout("point").slices["waypoints"]
+WAYPOINTS = get_robot("point").observation_layout().slices["waypoints"]
 
 
 def follow(observation: np.ndarray) -> np.ndarray:

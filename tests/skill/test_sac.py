@@ -14,13 +14,13 @@ from torch.testing import assert_close  # noqa: E402
 from torchrl.objectives import SACLoss  # noqa: E402
 
 from hiernav.config import load_config  # noqa: E402
-from hiernav.nav.observation import observation_layout  # noqa: E402
+from hiernav.sim.robots import get_robot  # noqa: E402
 from hiernav.skill.networks import Actor, Critic  # noqa: E402
 from hiernav.skill.perceptrons import _rectify  # noqa: E402
 from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 from hiernav.skill.train import alpha_floor, make_learner  # noqa: E402
 
-LAYOUT = observation_layout("point")
+LAYOUT = get_robot("point").observation_layout()
 SMALL = SacSettings(hidden=(16, 16))
 norms = pytest.mark.parametrize("layer_norm", [False, True])
 

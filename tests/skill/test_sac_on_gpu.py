@@ -14,12 +14,12 @@ pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 from tensordict import TensorDict  # noqa: E402
 
 from hiernav.device import Recorded  # noqa: E402
-from hiernav.nav.observation import observation_layout  # noqa: E402
+from hiernav.sim.robots import get_robot  # noqa: E402
 from hiernav.skill.replay import Replay  # noqa: E402
 from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 
 pytestmark = [pytest.mark.train, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")]
-LAYOUT = observation_layout("point")
+LAYOUT = get_robot("point").observation_layout()
 SETTINGS = SacSettings(hidden=(16, 16), layer_norm=True)
 
 
