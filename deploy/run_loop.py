@@ -422,14 +422,12 @@ class Episodes:
         truth: Truth | None = None
         with suppress(RuntimeError):  # the robot may be gone
             truth = self.driver.truth()
-        collisions, distance = None, None
-        if truth is not None:
-            collisions, distance = truth.collisions, float(np.linalg.norm(truth.pose[:2] - layout.goal))
+        episode = Episode.of(layout.seed, result, layout.goal, truth)
         text = f"seed {layout.seed}: {result.reason} after {result.steps} steps ({result.seconds:.1f} s)"
-        if collisions is not None:
-            text += f", {collisions} collisions"
+        if episode.collisions is not None:
+            text += f", {episode.collisions} collisions"
         self._print(f"{text}{': ' + result.detail if result.detail else ''}")
-        return Episode(layout.seed, result, collisions, distance)
+        return episode
 
     def _at_fault(self) -> bool:
         """Whether the run is to end with the exit code of a fault: who serves had those acknowledged that were."""

@@ -30,6 +30,23 @@ class Episode:
     true_distance: float | None = None
     """From the true position to the goal [m]; None where it is not known."""
 
+    @classmethod
+    def of(
+        cls, seed: int | None, result: RunResult, goal: np.ndarray, truth: Truth | None, collisions: int = 0
+    ) -> Episode:
+        """With what was true at its end, if that is known.
+
+        Args:
+            seed: of its world.
+            result: of the drive.
+            goal: (2,) world frame [m].
+            truth: at the end.
+            collisions: that there had been at the beginning.
+        """
+        if truth is None:
+            return cls(seed, result)
+        return cls(seed, result, truth.collisions - collisions, float(np.linalg.norm(truth.pose[:2] - goal)))
+
 
 @dataclass
 class Fault:
@@ -141,9 +158,5 @@ class GoalWatch(Observer):
     def _add(self, trip: Trip, result: RunResult) -> None:
         if result.fault is None and result.reason in ("fault", "estop"):
             result = replace(result, fault=result.detail)  # it was acknowledged before the robot was seen to stand
-        collisions, distance = None, None
-        if self._truth is not None:
-            collisions = self._truth.collisions - self._collisions
-            distance = float(np.linalg.norm(self._truth.pose[:2] - trip.goal))
-        self.account.add(Episode(self.seed, result, collisions, distance))
+        self.account.add(Episode.of(self.seed, result, trip.goal, self._truth, self._collisions))
         self._ended = None
