@@ -169,7 +169,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
     settings = robot_settings(spec)
     layouts = [sample_layout(parse_world(world), seed, spec.radius) for seed in seeds]
     plain = EXACT if case == NOISE_FREE else settings.noise
-    sigmas = ("accelerometer", "gyro", "magnetometer", "velocimeter", "extra", "fix")
+    sigmas = ("accelerometer", "gyro", "magnetometer", "velocimeter", "lidar", "extra", "fix")
     noise = replace(
         plain,
         **{name: case.noise * getattr(plain, name) for name in sigmas},

@@ -18,6 +18,8 @@ class SensorNoise:
     """In units of the field, which is 0.5."""
     velocimeter: float = 0.02
     """[m/s]"""
+    lidar: float = 0.0
+    """Of the distance to whatever is seen [m]."""
     extra: float = 0.0
     """Of the robot's own terms, in their units."""
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -34,7 +36,7 @@ class SensorNoise:
     """Probability that a fix is lost."""
 
     def __post_init__(self) -> None:
-        for name in ("accelerometer", "gyro", "magnetometer", "velocimeter", "extra", "fix", "fix_latency"):
+        for name in ("accelerometer", "gyro", "magnetometer", "velocimeter", "lidar", "extra", "fix", "fix_latency"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
                 raise ValueError(f"SensorNoise.{name} = {value} must be finite and not negative")

@@ -181,7 +181,7 @@ class SimRobot:
         return SensorFrame(
             stamp=now,
             **readings,
-            lidar=lidar_closeness(sim.pose, self.layout.obstacle_discs(now)[None])[0],
+            lidar=self._sense_lidar(now),
             extra=extra,
             position_fix=fix,
             fix_stamp=fix_stamp,
@@ -199,6 +199,13 @@ class SimRobot:
         turn += self.control_period * (noise.gyro_bias + noise.gyro / np.sqrt(count) * self._drift.standard_normal(3))
         self._before, self._sensed = after, self._sensed.copy()
         mujoco.mju_quatIntegrate(self._sensed, turn, 1.0)
+
+    def _sense_lidar(self, now: float) -> np.ndarray:
+        closeness = lidar_closeness(self._sim.pose, self.layout.obstacle_discs(now)[None])[0]
+        if self.noise.lidar > 0.0:
+            error = self.noise.lidar * self._rng.standard_normal(len(closeness))
+            closeness = np.minimum(closeness * np.exp(-error), 1.0)  # closeness is exp(-distance)
+        return closeness
 
     def _sense_position(self, now: float) -> tuple[np.ndarray | None, float | None]:
         noise = self.noise

@@ -46,6 +46,18 @@ def test_an_action_the_robot_cannot_take_is_refused(action):
         simulated().send(action)
 
 
+def test_a_noisy_lidar_is_off_by_a_distance_and_sees_nothing_where_nothing_is():
+    noisy, exact = simulated(noise=replace(EXACT, lidar=0.05)), simulated(noise=EXACT)
+    errors = []
+    for _ in range(200):
+        seen, true = noisy.read().lidar, exact.read().lidar
+        assert ((seen == 0.0) == (true == 0.0)).all() and seen.max() <= 1.0
+        errors.append(np.log(true[true > 0.0]) - np.log(seen[true > 0.0]))
+        noisy.brake()
+        exact.brake()
+    assert np.std(np.concatenate(errors)) == pytest.approx(0.05, rel=0.1)
+
+
 def test_reading_twice_draws_no_new_noise():
     robot = simulated()
     assert robot.read() is robot.read()
