@@ -172,6 +172,10 @@ class SkillConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Meta(description="Cap on the steps of a training episode; null: that of its world."),
     ] = None
     clock: Annotated[bool, Meta(description="Show the skill a gait clock of 3 Hz.")] = False
+    waypoint_frame: Annotated[
+        Literal["body", "world"],
+        Meta(description="That the skill observes waypoints in; world: for comparison, `run_loop.py` refuses it."),
+    ] = "body"
     precision: Annotated[
         Precision,
         Meta(description="Of products in hidden layers; auto: bfloat16 where the processor multiplies it natively."),

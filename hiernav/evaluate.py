@@ -264,7 +264,7 @@ def _from_bundle(path: Path) -> Policies:
     bundle.require_resolution(RESOLUTION)
     loaded = load_policies(bundle)
     manifest, terms = bundle.manifest, bundle.layout.names
-    skill = "default" if "waypoints" in terms else "baseline"
+    skill = "baseline" if "goal" in terms else "default"
     presets = load_config(
         None, [f"robot={robot.name}", f"planner.preset={manifest.planner.preset}", f"skill.preset={skill}"]
     )
@@ -284,7 +284,9 @@ def _from_bundle(path: Path) -> Policies:
             waypoints=manifest.plan.waypoints,
             spacing_m=manifest.plan.spacing_m,
         ),
-        skill=msgspec.structs.replace(presets.skill, clock="clock" in terms),
+        skill=msgspec.structs.replace(
+            presets.skill, clock="clock" in terms, waypoint_frame="world" if "world_waypoints" in terms else "body"
+        ),
     )
     bundle.require_layout(skill_layout(config))
     return Policies(config, loaded.skill, loaded.planner, manifest.goselo.channels, knows_reward=False)

@@ -76,6 +76,7 @@ _ACROSS_Y: dict[str, Rule] = {
     "magnetometer": _flip(-1, 1, -1),
     "lidar": (list(range(9, -1, -1)), [1.0] * 10),
     "waypoints": _flip(1, -1, repeat=10),
+    "world_waypoints": _flip(1, -1, repeat=10),
     "goal": _flip(1, -1),
 }
 _ACROSS_X: dict[str, Rule] = {
@@ -85,6 +86,7 @@ _ACROSS_X: dict[str, Rule] = {
     "magnetometer": _flip(-1, 1, 1),
     "lidar": ([(4 - i) % 10 for i in range(10)], [1.0] * 10),
     "waypoints": _flip(-1, 1, repeat=10),
+    "world_waypoints": _flip(-1, 1, repeat=10),
     "goal": _flip(-1, 1),
 }
 _OWN: dict[str, Rule] = {

@@ -73,6 +73,7 @@ _BASE = (
     ObservationTerm("lidar", 10, "closeness", 1.0),
 )
 _WAYPOINTS = ObservationTerm("waypoints", 20, "m, body frame", 2.0)
+_WORLD_WAYPOINTS = ObservationTerm("world_waypoints", 20, "m, world frame", 0.5)
 _GOAL = ObservationTerm("goal", 2, "m, body frame", 0.5)
 CLOCK_HZ = 3.0
 """Frequency of the gait clock: about that of the fastest gaits of the quadruped under open-loop sinusoids."""
@@ -86,14 +87,15 @@ def observation_layout(
 
     Args:
         own: terms that only this robot has (`RobotSpec.own_terms`).
-        guidance: "waypoints" (path-conditioned) or "goal" (the paper's baseline).
+        guidance: "waypoints" (path-conditioned), "goal" (the paper's baseline), or "world_waypoints" (in the
+            world frame, where the others are in the body frame: to show what that is good for).
         clock: whether the skill sees a gait clock (beyond the paper). A gait is periodic: with the clock it is a
             function of the observation, and no pose of the robot is one that its mean action holds for ever.
     """
-    if guidance not in ("waypoints", "goal"):
-        raise ValueError(f"unknown guidance {guidance!r}; known: waypoints, goal")
-    guide = _WAYPOINTS if guidance == "waypoints" else _GOAL
-    return ObservationLayout((*_BASE, guide, *own, *((_CLOCK,) if clock else ())))
+    guides = {term.name: term for term in (_WAYPOINTS, _WORLD_WAYPOINTS, _GOAL)}
+    if guidance not in guides:
+        raise ValueError(f"unknown guidance {guidance!r}; known: {', '.join(guides)}")
+    return ObservationLayout((*_BASE, guides[guidance], *own, *((_CLOCK,) if clock else ())))
 
 
 def clock_phase(time: np.ndarray) -> np.ndarray:

@@ -537,10 +537,12 @@ def guided(
 ) -> dict[str, np.ndarray]:
     """Add what guides the skill to its sensors: waypoints and goal in the present body frame, and the gait clock.
 
+    The waypoints are there in the world frame as well, for a skill that is made to observe them so.
     `time` (N,) is that since the start of each episode [s]; None for a skill without a clock.
     """
     guides = world_to_body(np.concatenate([plan, np.asarray(goal, dtype=np.float64)[:, None]], axis=1), pose)
-    values = {**terms, "waypoints": guides[:, :-1].reshape(len(pose), -1), "goal": guides[:, -1]}
+    body, world = (points.reshape(len(pose), -1) for points in (guides[:, :-1], plan))
+    values = {**terms, "waypoints": body, "world_waypoints": world, "goal": guides[:, -1]}
     if time is not None:
         values["clock"] = clock_phase(time)
     return values

@@ -191,8 +191,8 @@ def _replanning(book: Book) -> str:
 
 def _ablations(book: Book) -> str:
     return (
-        "<p>Each departure from the paper switched off (layer normalisation and learned plans: switched on). The frame "
-        "of the waypoints cannot be switched: the observation is built in the body frame alone.</p>"
+        "<p>Each departure from the paper switched off (layer normalisation, learned plans and the "
+        "world’s frame: switched on).</p>"
         "<h3>In driving</h3>" + _by_robot(lambda robot: tables.driving_ablations(book, robot)) + "<h3>In training</h3>"
         f"<p>The {ABLATED} is trained so, and in the place of it the {TABLE3_ROBOT} for: "
         + "; ".join(escape(tables.WHAT[name]) for name in OF_LEGS)

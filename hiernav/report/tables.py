@@ -46,7 +46,7 @@ WHAT = {
     "no-alpha-floor": "no floor of the temperature", "no-tilt-cost": "no cost of tilting",
     "no-time-cost": "no cost of time", "go-on-after-fall": "training goes on after a fall",
     "no-clock": "no gait clock", "layer-norm": "with layer normalisation in the critics",
-    "learned-plans": "trained with the network's plans",
+    "learned-plans": "trained with the network's plans", "world-frame": "waypoints in the world frame",
 }  # fmt: skip
 """Ablation -> what differs."""
 

@@ -83,11 +83,14 @@ TRAINING = {
     "no-clock": ["skill.clock=false"],
     "layer-norm": ["skill.layer_norm=true"],
     "learned-plans": ["skill.planner=cnn"],
+    "world-frame": ["skill.waypoint_frame=world"],
 }
 """Departures that have to be trained without (`layer-norm` and `learned-plans`: with). One that changes nothing for a
 robot is left out for it."""
 OF_LEGS = ("no-tilt-cost", "go-on-after-fall", "no-clock", "no-time-cost")
 """Departures that are left out with the quadruped instead."""
+NEUTRAL = {"waypoint_frame": "body"}
+"""Settings of the skill that came after the first results, and the values that say what was done before."""
 BASELINE = [
     "skill.preset=baseline", "skill.reward_scale=1.0",
     "reward.time=0", "reward.tilt=-3", "reward.leave_field=-60", "reward.fall=-60",
@@ -274,7 +277,9 @@ class _Maker:
     def _config(self, seed: int, overrides: list[str]) -> str:
         file = self.root / "configs" / f"{self.robot}.yaml"
         config = _load(file, file.stat().st_mtime_ns, (*overrides, *self.size.training, "run_dir=null"))
-        return msgspec.json.encode(msgspec.structs.replace(config, seed=seed)).decode()
+        values = msgspec.to_builtins(msgspec.structs.replace(config, seed=seed))
+        values["skill"] = {key: v for key, v in values["skill"].items() if (key, v) not in NEUTRAL.items()}
+        return msgspec.json.encode(values).decode()
 
     def _fine_tuning_config(self, world: str, trained: bool) -> str:
         """What decides a fine-tuning of a trained run, or of the bundle, whose own part its hashes tell."""

@@ -12,7 +12,7 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
 from hiernav.runtime.estimate import Estimate
 
-GUIDES = ("waypoints", "goal", "clock")
+GUIDES = ("waypoints", "world_waypoints", "goal", "clock")
 """Observation terms that the agent adds to those of the robot's sensors."""
 
 

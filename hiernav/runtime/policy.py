@@ -146,7 +146,7 @@ def _require_waypoints(bundle: Bundle) -> None:
     """BundleError unless the skill observes as many waypoints as a plan has; a baseline observes none."""
     count = bundle.manifest.plan.waypoints
     for term in bundle.layout.terms:
-        if term.name == "waypoints" and term.size != 2 * count:
+        if term.name in ("waypoints", "world_waypoints") and term.size != 2 * count:
             raise BundleError(f"plan.waypoints: {count} in a plan, the skill observes {term.size / 2:g}")
 
 

@@ -101,7 +101,9 @@ def make_task(
 
 def skill_layout(config: TrainConfig) -> ObservationLayout:
     """Observation layout of a configuration's skill."""
-    guidance = "goal" if config.skill.preset == "baseline" else "waypoints"
+    guidance = "waypoints" if config.skill.waypoint_frame == "body" else "world_waypoints"
+    if config.skill.preset == "baseline":
+        guidance = "goal"
     return get_robot(config.robot).observation_layout(guidance, config.skill.clock)
 
 

@@ -77,7 +77,7 @@ def run_episodes(
     current = np.full(task.num_rows, -1)
     current[:rows] = np.arange(rows)
     waiting = rows
-    guided = "waypoints" in task.layout.names
+    guided = "goal" not in task.layout.names
     task.recovery = (
         Recovery(task.num_rows, task.robot.control_period, task.robot.radius) if recover and guided else None
     )

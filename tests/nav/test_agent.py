@@ -20,8 +20,8 @@ FAR = (2.5, 0.0)
 PERIOD = 0.1
 
 
-@pytest.mark.parametrize("guidance", ["waypoints", "goal"])
-def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guidance: str) -> None:
+@pytest.mark.parametrize("guidance", ["waypoints", "world_waypoints", "goal"])
+def test_what_guides_the_skill_is_expressed_in_its_frame_at_each_step(guidance: str) -> None:
     layout = get_robot("point").observation_layout(guidance)
     sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}
     agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 2), lambda o: np.tanh(o[:, :2]), layout, PERIOD)
@@ -35,8 +35,9 @@ def test_what_guides_the_skill_is_expressed_in_the_body_frame_of_each_step(guida
         step = agent.act(pose, sensors, goal, [FREE] * 2)
         assert step.replanned.tolist() == [tick == 0] * 2
         seen = step.observation[:, layout.slices[guidance]].astype(float).reshape(2, -1, 2)
-        expected = step.plan if guidance == "waypoints" else goal[:, None]
-        assert_allclose(body_to_world(seen, pose), expected, atol=1e-6)
+        expected = goal[:, None] if guidance == "goal" else step.plan
+        shown = seen if guidance == "world_waypoints" else body_to_world(seen, pose)
+        assert_allclose(shown, expected, atol=1e-6)
         assert_allclose(step.plan[:, 4], [[0.5, 0.0], [0.0, 0.5]], atol=1e-12)
         assert_array_equal(step.action, np.tanh(step.observation[:, :2]))
 

@@ -26,7 +26,7 @@ def twin(layout, flip):
     return replace(layout, pillars=layout.pillars * flip, start=start, goal=layout.goal * flip)
 
 
-@pytest.mark.parametrize("guidance", ["waypoints", "goal"])
+@pytest.mark.parametrize("guidance", ["waypoints", "world_waypoints", "goal"])
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
 def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidance: str) -> None:
     spec, layout = get_robot(robot), get_robot(robot).observation_layout(guidance, clock=True)
@@ -48,6 +48,7 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
             **sim.sensors,
             "lidar": lidar_closeness(sim.pose, discs),
             "waypoints": world_to_body(plans, sim.pose).reshape(2, -1),
+            "world_waypoints": plans.reshape(2, -1),
             "goal": world_to_body(goals[:, None], sim.pose)[:, 0],
             # the left and the right legs step in turn: the twin's clock goes half a period behind
             "clock": clock_phase(sim.time + np.array([0.0, 0.5 / CLOCK_HZ])),

@@ -397,6 +397,12 @@ def test_an_ablation_differs_from_ours_and_its_folder_too():
     assert {c.robot for c in cells if c.experiment == "ablations" and c.kind == "train"} == {"car", "doggo"}
 
 
+def test_a_setting_that_came_later_makes_no_other_training_of_one_that_has_it_as_it_was():
+    configs = {each.variant: each.config for each in catalogue(ROOT, robots=["car"]) if each.kind == "train"}
+    assert '"waypoint_frame":"world"' in configs["world-frame"]
+    assert not any("waypoint_frame" in config for name, config in configs.items() if name != "world-frame")
+
+
 def test_what_needs_no_training_can_be_had_alone():
     cells = select(CELLS, training=False)
     assert {each.kind for each in cells} == {"evaluate", "film", "walk"}
