@@ -44,7 +44,7 @@ from hiernav import __version__
 from hiernav.decode import ConfigError
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.occupancy import RESOLUTION
-from hiernav.runtime.account import KEPT, Account, Episode, FaultWatch, GoalWatch
+from hiernav.runtime.account import KEPT, Account, FaultWatch, GoalWatch
 from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
 from hiernav.runtime.control import ControlServer, default_socket, parse_point, tell
 from hiernav.runtime.driver import Driver
@@ -60,7 +60,7 @@ from hiernav.runtime.policy import make_agent, require_fit
 from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import request_realtime
-from hiernav.runtime.robot import Robot, Truth
+from hiernav.runtime.robot import Robot
 from hiernav.runtime.settings import Settings, load_settings
 from hiernav.runtime.summary import print_summary, summarise
 from hiernav.runtime.supervisor import Mode
@@ -293,7 +293,7 @@ class Episodes:
         self.arguments, self.layouts, self.remote, self.link = arguments, layouts, remote, link
         self.layout = layouts[0]
         self.interrupted = self.failed = False
-        serves = arguments.serve or arguments.view is not None
+        self.serves = serves = arguments.serve or arguments.view is not None
         clock: Clock
         robot: Robot
         if remote is not None:
@@ -339,7 +339,7 @@ class Episodes:
                 opened.callback(self.recorder.close)
             self.account = Account(kept=KEPT if serves else None, began=clock.now())
             self.faults = FaultWatch(self.account)
-            self.goals = GoalWatch(self.driver, self.account, self.layout.seed) if serves else None
+            self.goals = GoalWatch(self.driver, self.account, self.layout.seed)
             self.granted = {} if arguments.fast else request_realtime(settings.realtime)
             self.console = _screen(arguments)
             opened.pop_all()
@@ -369,12 +369,13 @@ class Episodes:
                     self.driver.supervisor.acknowledge(self.driver.clock.now())
             if self.interrupted:
                 break
-            self.account.add(self._episode(layout, self.driver.run(layout.goal)))
+            self.goals.seed = layout.seed
+            self._tell(layout, self.driver.run(layout.goal))
             if self.driver.interrupted or self.driver.gone or self.driver.supervisor.latched and self.arguments.adapter:
                 break
 
     def _serve(self, drives: list[Drive]) -> None:
-        assert self.server is not None and self.goals is not None
+        assert self.server is not None
         drives.append(Drive())
         self._watch(drives[-1])
         if self.page is not None and not (self.arguments.serve or self.arguments.adapter):
@@ -384,7 +385,7 @@ class Episodes:
                 self._print(f"ready for goals: run_loop.py --tell 'goal X,Y'  (socket {self.server.path})")
                 self.driver.serve()
         finally:
-            self.goals.close()
+            self.goals.take_result()
         if not (self.driver.stopped or self._at_fault()):
             self.faults.open = self.account.add_fault("the robot was not seen to stand", self.driver.clock.now())
 
@@ -418,29 +419,27 @@ class Episodes:
         others = (self.goals, self.recorder, self.page)
         self.driver.audience.observers = [drive, self.faults, *filter(None, others)]
 
-    def _episode(self, layout: Layout, result: RunResult) -> Episode:
-        truth: Truth | None = None
-        with suppress(RuntimeError):  # the robot may be gone
-            truth = self.driver.truth()
-        episode = Episode.of(layout.seed, result, layout.goal, truth)
+    def _tell(self, layout: Layout, result: RunResult) -> None:
+        """Account for a drive, and say what has come of it."""
+        self.goals.take_result()
         text = f"seed {layout.seed}: {result.reason} after {result.steps} steps ({result.seconds:.1f} s)"
-        if episode.collisions is not None:
-            text += f", {episode.collisions} collisions"
+        collisions = self.account.episodes[-1].collisions
+        if collisions is not None:
+            text += f", {collisions} collisions"
         self._print(f"{text}{': ' + result.detail if result.detail else ''}")
-        return episode
 
     def _at_fault(self) -> bool:
         """Whether the run is to end with the exit code of a fault: who serves had those acknowledged that were."""
         if self.failed or self.driver.gone:
             return True
-        if self.goals is None:
+        if not self.serves:
             return any(episode.result.fault for episode in self.account.episodes)
         return self.faults.open is not None or self.driver.supervisor.mode is Mode.FAULT
 
     def _finish(self, drives: Sequence[Drive]) -> int:
         """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""
         code = OK
-        if self.goals is None and any(episode.result.refused for episode in self.account.episodes):
+        if not self.serves and any(episode.result.refused for episode in self.account.episodes):
             code = BAD_GOAL  # who serves was asked for many goals, and told of each
         if self._at_fault():
             code = FAULT
@@ -470,7 +469,7 @@ class Episodes:
 
     def _draw(self, drives: Sequence[Drive]) -> None:
         ends = [episode.result.reason for episode in self.account.episodes]
-        if self.goals is not None:  # one drive to all of them
+        if self.serves:  # one drive to all of them
             ends = [", ".join(f"{reason} {count}" for reason, count in self.account.ends.items())] if ends else []
         for layout, drive, end in zip(self.layouts, drives, ends, strict=False):
             if drive.path:

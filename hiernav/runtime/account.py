@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,26 +25,9 @@ class Episode:
     seed: int | None
     result: RunResult
     collisions: int | None = None
-    """Control steps with contact; None where nothing measures it."""
+    """Control steps with contact until it ended; None where nothing measures it."""
     true_distance: float | None = None
-    """From the true position to the goal [m]; None where it is not known."""
-
-    @classmethod
-    def of(
-        cls, seed: int | None, result: RunResult, goal: np.ndarray, truth: Truth | None, collisions: int = 0
-    ) -> Episode:
-        """With what was true at its end, if that is known.
-
-        Args:
-            seed: of its world.
-            result: of the drive.
-            goal: (2,) world frame [m].
-            truth: at the end.
-            collisions: that there had been at the beginning.
-        """
-        if truth is None:
-            return cls(seed, result)
-        return cls(seed, result, truth.collisions - collisions, float(np.linalg.norm(truth.pose[:2] - goal)))
+    """From the true position to the goal in the tick that ended it [m]; None where it is not known."""
 
 
 @dataclass
@@ -115,48 +97,49 @@ class FaultWatch(Observer):
 
 
 class GoalWatch(Observer):
-    """Notes each goal that ends while a loop serves, once the robot is seen to stand or drives to the next one."""
+    """Notes each goal that ends, once the robot is seen to stand or drives to the next one."""
 
     def __init__(self, driver: Driver, account: Account, seed: int | None = None) -> None:
         """
         Args:
-            driver: that serves.
+            driver: that drives.
             account: that takes the goals.
-            seed: of the world it serves in.
+            seed: of the world it drives in.
         """
         self.driver, self.account, self.seed = driver, account, seed
         self._ended: Trip | None = None
         self._newest: RunResult | None = None
         self._truth: Truth | None = None
-        self._collisions = 0
+        """Of the newest tick, or of the one in which a goal ended that is not noted yet."""
+        self._settled = False
+        """Whether it is the latter."""
+        self._before: int | None = None
+        """Collisions that there had been when the goal was set; None if that was in this tick."""
 
     def event(self, event: Event) -> None:
         if event.kind == "end":
-            self._ended = self.driver.last_trip
+            self._ended, self._settled = self.driver.last_trip, False
         elif event.kind == "goal" and "x" in event.values:
-            self._take_result()
-            self._collisions = 0 if self._truth is None else self._truth.collisions
+            self.take_result()
+            self._ended, self._before = None, None
 
     def tick(self, record: TickRecord) -> None:
-        self._truth = record.truth
-        self._take_result()
+        if not self._settled:  # a tick is told of after what happened in it
+            self._truth, self._settled = record.truth, self._ended is not None
+        if self._before is None and record.truth is not None:
+            self._before = record.truth.collisions
+        self.take_result()
 
-    def close(self) -> None:
-        """The loop has ended, and with it the last goal."""
-        with suppress(RuntimeError):  # the robot may be gone
-            self._truth = self.driver.truth()
-        self._take_result()
-
-    def _take_result(self) -> None:
-        """Of the goal that ended last, if the driver has it by now."""
-        result = self.driver.last_result
-        if result is None or result is self._newest or self._ended is None:
+    def take_result(self) -> None:
+        """Note the goal that ended last, if the driver has its result by now; to be called when a loop has ended."""
+        trip, result = self._ended, self.driver.last_result
+        if trip is None or result is None or result is self._newest:
             return
-        self._newest = result
-        self._add(self._ended, result)
-
-    def _add(self, trip: Trip, result: RunResult) -> None:
+        self._newest, self._ended, self._settled = result, None, False
         if result.fault is None and result.reason in ("fault", "estop"):
             result = replace(result, fault=result.detail)  # it was acknowledged before the robot was seen to stand
-        self.account.add(Episode.of(self.seed, result, trip.goal, self._truth, self._collisions))
-        self._ended = None
+        collisions, distance = None, None
+        if self._truth is not None:
+            collisions = self._truth.collisions - (self._truth.collisions if self._before is None else self._before)
+            distance = float(np.linalg.norm(self._truth.pose[:2] - trip.goal))
+        self.account.add(Episode(self.seed, result, collisions, distance))

@@ -108,10 +108,8 @@ def driven(folder: Path) -> list[str]:
 
 
 def test_a_signal_between_two_worlds_costs_nothing_of_what_was_driven(run, tmp_path, monkeypatch):
-    episode = script.Episodes._episode
-    monkeypatch.setattr(
-        script.Episodes, "_episode", lambda *given: signal.raise_signal(signal.SIGTERM) or episode(*given)
-    )
+    tell = script.Episodes._tell
+    monkeypatch.setattr(script.Episodes, "_tell", lambda *given: signal.raise_signal(signal.SIGTERM) or tell(*given))
     assert run(*SHORT, "--episodes", "3") == 0
     assert driven(tmp_path) == ["timeout"]
 
@@ -147,6 +145,28 @@ def test_a_world_that_cannot_be_entered_is_a_fault_and_costs_nothing_of_what_was
     assert run(*SHORT, "--episodes", "5", "--no-pictures") == script.FAULT
     assert driven(tmp_path) == ["timeout", "timeout"] and begun[-1] == 2
     assert capsys.readouterr().err == "run_loop: the robot's adapter ended with status -9\n"
+
+
+def test_each_drive_has_its_own_collisions_and_the_distance_at_its_end_whatever_its_robot_counts(
+    run, tmp_path, monkeypatch
+):
+    reset, stop = SimRobot.reset, Driver._stop
+
+    def reset_some(robot: SimRobot, layout: object, seed: int) -> None:
+        reset(robot, layout, seed)
+        robot._collisions = 7
+
+    def stop_elsewhere(driver: Driver) -> bool:
+        driver.robot._collisions += 3
+        driver.robot._sim.pose = driver.robot._sim.pose + 5.0
+        return stop(driver)
+
+    monkeypatch.setattr(SimRobot, "reset", reset_some)
+    monkeypatch.setattr(Driver, "_stop", stop_elsewhere)
+    assert run(*SHORT, "--episodes", "2", "--no-pictures") == 0
+    for episode in json.loads((tmp_path / "out/summary.json").read_text())["episodes"]:
+        assert episode["collisions"] == 0
+        assert episode["true_distance"] == pytest.approx(episode["distance"], abs=0.1)
 
 
 def test_a_screen_that_nobody_reads_costs_neither_worlds_nor_account_nor_exit_code(tmp_path):
