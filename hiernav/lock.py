@@ -27,6 +27,18 @@ _held: WeakValueDictionary[Path, _Held] = WeakValueDictionary()
 """Locks that this process has: whoever works on a folder here may do so twice."""
 
 
+def try_lock(file: int) -> bool:
+    """Whether an open file is locked by this process now, until it is closed; so it is where there are no locks."""
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:  # a file system without locks
+            pass
+    return True
+
+
 class FolderLock:
     """A process's lock on a folder, from `acquire` to `release`, or as long as this object lives."""
 
@@ -40,7 +52,7 @@ class FolderLock:
         Raises:
             OSError: the folder cannot be written to.
         """
-        if self._held is None and fcntl is not None:
+        if self._held is None and fcntl is not None:  # else no file is made either
             folder = self.folder.resolve()
             self._held = _held.get(folder) or _lock(folder / LOCK)
             if self._held is None:
@@ -54,10 +66,4 @@ class FolderLock:
 
 def _lock(file: Path) -> _Held | None:
     held = _Held(os.open(file, os.O_RDWR | os.O_CREAT, 0o666))  # not inherited by programs started here
-    try:
-        fcntl.flock(held.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return None
-    except OSError:  # a file system without locks
-        pass
-    return held
+    return held if try_lock(held.file) else None

@@ -52,7 +52,7 @@ def episode(**changes: object) -> Episode:
     values: dict[str, object] = {
         "seed": 0, "reached": True, "reason": "goal", "steps": 40, "cap": 300, "collisions": 0, "return_": 1.0,
         "path_length": 2.0, "shortest_length": 1.0, "replans": dict.fromkeys(REASONS, 1), "refused": 0,
-        "recoveries": 1, "plan_seconds": 0.1,
+        "recoveries": 1,
     }  # fmt: skip
     return Episode(**(values | changes))  # type: ignore[arg-type]
 
@@ -186,7 +186,7 @@ def test_the_same_seed_gives_the_same_episodes_however_many_run_side_by_side(wor
         episodes: dict[int, Episode] = {}
 
         def keep(_, index, done, episodes=episodes):
-            episodes[index] = replace(done, plan_seconds=0.0)
+            episodes[index] = done
 
         results = evaluate(policies_of(), [spec], planner="astar", episodes=8, seed=2, rows=rows, on_episode=keep)
         kept[rows] = (without_clock(results), [episodes[index] for index in range(8)])

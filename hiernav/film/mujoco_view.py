@@ -44,7 +44,7 @@ class MujocoView:
             self._camera.lookat = (pose[0], pose[1], task.robot.radius)
         self._renderer.update_scene(task.sim.datas[0], self._camera)
         _mark(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (*task.goal[0], 0.002), (GOAL_RADIUS, 0.002, 0.0), GOAL)
-        for x, y in step.option.plan[0]:
+        for x, y in step.plan[0]:
             _mark(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (x, y, 0.03), (0.02, 0.0, 0.0), PLAN)
         return self._renderer.render()
 

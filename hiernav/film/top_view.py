@@ -75,7 +75,7 @@ class TopView:
             return picture
         if self._lidar:
             self._draw_lidar(picture, time)
-        plan = self._pixels(np.concatenate([step.option.start[:1], step.option.plan[0]]))
+        plan = self._pixels(np.concatenate([step.option.start[:1], step.plan[0]]))
         _lines(picture, [plan], PLAN, 1)
         for point in plan[1:]:
             cv2.circle(picture, point.tolist(), 3 << _SHIFT, rgb(PLAN), cv2.FILLED, cv2.LINE_AA, _SHIFT)

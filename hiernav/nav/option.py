@@ -171,9 +171,10 @@ class OptionStep:
 class WaypointOption:
     """Plans of N robots: when each one ends, a new one is asked for.
 
-    A row whose planner finds nothing (NaN) or nonsense, or whose position is not finite, keeps the plan it has, or
-    holds its position if it has none, and asks again at the next step; such refusals are counted. So does a row whose
-    planner works elsewhere, with its newest state at every step, until `adopt` brings the plan.
+    A row whose planner finds nothing (NaN) or nonsense keeps the plan it has, or holds its position if it has none, and
+    asks with its newest state at every step until there is a plan; such refusals are counted, the end of the plan once.
+    So does a row whose planner works elsewhere, until `adopt` brings the plan. One whose position is not finite is not
+    asked for.
     """
 
     planner: Planner | DeferredPlanner
@@ -373,7 +374,8 @@ class WaypointOption:
         """Ask for plans of some rows; (M,) bool, which of them have a new one."""
         plan = np.full((len(rows), self.num_waypoints, 2), np.nan)
         known = np.flatnonzero(np.isfinite(position).all(axis=1) & np.isfinite(goal).all(axis=1))
-        later = np.zeros(len(rows), dtype=bool)
+        later, asked = np.zeros(len(rows), dtype=bool), np.zeros(len(rows), dtype=bool)
+        asked[known] = True
         if len(known):
             visits = [self.visits[row] for row in rows[known].tolist()]
             query = PlanQuery(
@@ -391,7 +393,6 @@ class WaypointOption:
                 if proposed.shape != plan[known].shape:
                     raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
                 plan[known] = proposed
-        self.waiting[rows[later]] = True
         # not "> max_reach", so that NaN is refused too
         good = (np.abs(plan - position[:, None]) <= self.max_reach).all(axis=(1, 2))
         self.refused[rows[~good & ~later]] += 1
@@ -400,7 +401,7 @@ class WaypointOption:
         for k in np.flatnonzero(good | hold).tolist():
             self._follow(int(rows[k]), plan[k], position[k], occupancy[k])
         self.started[rows[good]] = True
-        self.waiting[rows[good]] = False
+        self.waiting[rows[asked]] = ~good[asked]
         return good
 
     def _follow(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import fnmatch
 import time
 from collections import defaultdict
@@ -13,6 +12,7 @@ from typing import Literal
 
 import msgspec
 
+from hiernav.lock import try_lock
 from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key, training_hash
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
@@ -294,9 +294,4 @@ def _claimed(cell: Cell, places: Places) -> Iterator[bool]:
     path = places.runs / "locks" / f"{cell.claim}.lock"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-            return
-        yield True
+        yield try_lock(file.fileno())

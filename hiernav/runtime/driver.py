@@ -154,7 +154,7 @@ class Driver:
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
         self._requests: deque[tuple[Ticket, Callable[[float], None]]] = deque()
-        self._stops: deque[Ticket] = deque(maxlen=REQUESTS)
+        self._stops: deque[Ticket] = deque()
         self._trip: Trip | None = None
         self._ended: Trip | None = None
         self._last_trip: Trip | None = None

@@ -72,7 +72,8 @@ class EstimatorConfig:
 
     def __post_init__(self) -> None:
         for name, value in self.__dict__.items():
-            if isinstance(value, float) and not (math.isfinite(value) and value > 0.0):
+            numeric = isinstance(value, int | float) and not isinstance(value, bool)
+            if numeric and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"EstimatorConfig.{name} = {value} must be finite and positive")
         if not self.gate_probability < 1.0:
             raise ValueError(f"EstimatorConfig.gate_probability = {self.gate_probability} must be below 1")

@@ -18,8 +18,9 @@ LEARN = 10
 """Readings without repetition after which a sensor is known to be noisy."""
 REPEATS = 3
 """Repetitions in a row, while nothing else changes either, that a noisy sensor never shows."""
-TRAVEL = 0.05
-"""A way that changes whatever lidar and joints read, unless they read nothing at all [m]."""
+TRAVEL, SPARE = 0.05, 3.0
+"""A way that changes what lidar and joints read [m], or where they are coarse, as a multiple of the longest on which a
+reading has lasted."""
 
 
 @dataclass
@@ -152,6 +153,10 @@ class _Term:
     """When that was first said [s]..."""
     place: tuple[float, float] = (0.0, 0.0)
     """...and where [m]."""
+    lasted: float = 0.0
+    """How far from there it was said again [m]."""
+    longest: float = 0.0
+    """The same of all readings before [m]."""
     changes: int = 0
     repeats_itself: bool = False
 
@@ -160,8 +165,9 @@ class TermWatch:
     """Remembers when each sensor that only the skill needs last said something that it can use: lidar, robot's own.
 
     They may be without noise, and say the same for as long as the robot stands. One that has changed often enough and
-    then repeats itself to the bit while the robot travels is frozen, unless it reads nothing but zeros, as a lidar does
-    where nothing is near. One that travels so before it has changed often, a gripper say, is not judged.
+    then repeats itself to the bit while the robot travels, much farther than ever before, is frozen, unless it reads
+    nothing but zeros, as a lidar does where nothing is near. One that travels so before it has changed often, a gripper
+    say, is not judged.
     """
 
     def __init__(self) -> None:
@@ -170,7 +176,8 @@ class TermWatch:
     def begin_again(self, stamp: float) -> None:
         """The robot's clock is another one from `stamp` [s] on: forget all readings, not which sensors repeat them."""
         for name, term in self._terms.items():
-            self._terms[name] = _Term(stamp, repeats_itself=term.repeats_itself)
+            longest = max(term.longest, term.lasted)
+            self._terms[name] = _Term(stamp, longest=longest, repeats_itself=term.repeats_itself)
 
     def see(self, name: str, value: np.ndarray, stamp: float, place: tuple[float, float]) -> None:
         """Take note of a reading at `stamp` [s].
@@ -188,13 +195,17 @@ class TermWatch:
             return
         reading = np.asarray(value).tobytes()
         if reading != term.reading:
-            term.reading, term.new, term.place = reading, stamp, place
+            term.longest = max(term.longest, term.lasted)
+            term.reading, term.new, term.place, term.lasted = reading, stamp, place, 0.0
             term.changes += 1
-        elif not term.repeats_itself and any(reading) and math.dist(place, term.place) > TRAVEL:
-            if term.changes > LEARN:
-                term.heard = min(term.heard, term.new)
-                return
-            term.repeats_itself = True
+        elif not term.repeats_itself and np.any(value):
+            way = math.dist(place, term.place)
+            if way > max(TRAVEL, SPARE * term.longest):
+                if term.changes > LEARN:
+                    term.heard = min(term.heard, term.new)
+                    return
+                term.repeats_itself = True
+            term.lasted = max(term.lasted, way)
         term.heard = stamp
 
     def silences(self, stamp: float) -> Iterator[tuple[str, float]]:

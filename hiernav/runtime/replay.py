@@ -235,9 +235,18 @@ def _state(estimate: Estimate | None) -> object:
     )
 
 
+def _differ(recorded: np.ndarray, replayed: np.ndarray) -> np.ndarray:
+    """Where two arrays of one shape differ by a bit. What is no number is alike: a recording does not keep its bits."""
+    recorded = recorded.astype(replayed.dtype)
+    if not np.issubdtype(replayed.dtype, np.floating):
+        return recorded != replayed
+    alike = (recorded == replayed) & (np.signbit(recorded) == np.signbit(replayed))
+    return ~(alike | (np.isnan(recorded) & np.isnan(replayed)))
+
+
 def _same(recorded: object, replayed: object) -> bool:
     if isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray):
-        return recorded.shape == replayed.shape and recorded.astype(replayed.dtype).tobytes() == replayed.tobytes()
+        return recorded.shape == replayed.shape and not _differ(recorded, replayed).any()
     return type(recorded) is type(replayed) and recorded == replayed
 
 
@@ -245,9 +254,6 @@ def _texts(recorded: object, replayed: object) -> tuple[str, str]:
     """Both values; of arrays the first element that differs."""
     if isinstance(recorded, np.ndarray) and isinstance(replayed, np.ndarray) and recorded.shape == replayed.shape:
         ours, theirs = recorded.ravel(), replayed.ravel()
-        bits = ours.astype(theirs.dtype).view(np.uint8).reshape(len(ours), -1) != theirs.view(np.uint8).reshape(
-            len(theirs), -1
-        )
-        k = int(np.flatnonzero(bits.any(axis=1))[0])
+        k = int(np.flatnonzero(_differ(ours, theirs))[0])
         return f"{float(ours[k])!r} (element {k})", repr(float(theirs[k]))
     return str(recorded), str(replayed)

@@ -83,9 +83,7 @@ class NavigationGymEnv(gymnasium.Env):
         layout, pose = self.task.layouts[0], self.task.pose[0]
         if layout is None:
             raise gymnasium.error.ResetNeeded("render() before reset(): there is no world yet")
-        return draw_from_above(
-            layout, float(self.task.sim.time[0]), pose, self.task.robot.radius, self.task.option.plan[0]
-        )
+        return draw_from_above(layout, float(self.task.sim.time[0]), pose, self.task.robot.radius, self.task.plan[0])
 
     def close(self) -> None:
         self.task.sim.close()

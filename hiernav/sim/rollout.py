@@ -36,8 +36,6 @@ class Episode:
     refused: int
     recoveries: int
     """Times the robot stood still and backed out."""
-    plan_seconds: float
-    """Time spent in the planner."""
 
     @property
     def steps_counted(self) -> int:
@@ -83,7 +81,7 @@ def run_episodes(
     )
     # rows without an episode of their own repeat one and are not looked at
     task.reset(layouts=[layouts[row % rows] for row in range(task.num_rows)])
-    driven, earned, planned = (np.zeros(task.num_rows) for _ in range(3))
+    driven, earned = (np.zeros(task.num_rows) for _ in range(2))
     collisions = np.zeros(task.num_rows, dtype=np.int64)
     while (current >= 0).any():
         idle = current < 0
@@ -93,7 +91,6 @@ def run_episodes(
         driven += np.linalg.norm(task.pose[:, :2] - before, axis=-1)
         earned += step.reward
         collisions += step.collided
-        planned += step.option.plan_seconds / task.num_rows
         if on_step is not None:
             on_step(step)
         ended = np.flatnonzero((step.terminated | step.truncated) & (current >= 0))
@@ -115,7 +112,6 @@ def run_episodes(
                 replans={r.name.lower(): int(counts[r]) for r in TerminationReason if r != TerminationReason.NONE},
                 refused=int(task.option.refused[row]),
                 recoveries=0 if task.recovery is None else int(task.recovery.counts[row]),
-                plan_seconds=float(planned[row]),
             )
             results[current[row]] = episode
             if on_episode is not None:
@@ -126,7 +122,7 @@ def run_episodes(
         current[ended[: len(following)]] = following
         again = ended[: len(following)]
         task.reset(again, [layouts[index] for index in following.tolist()])
-        for values in (driven, earned, planned, collisions):
+        for values in (driven, earned, collisions):
             values[ended] = 0
     return [episode for episode in results if episode is not None]
 

@@ -50,10 +50,12 @@ class TaskStep:
     broken: np.ndarray
     """(N,) bool: the physics is no longer finite."""
     option: OptionStep
+    plan: np.ndarray
+    """(N, K, 2) what the skill follows, world frame [m]: the option's plan, or a way out (`Recovery`)."""
 
     @property
     def terminated(self) -> np.ndarray:
-        """(N,) bool: the episode has ended for good (goal or field left)."""
+        """(N,) bool: the episode has ended for good (goal, field left, fallen, broken)."""
         return self.reached | self.left | self.fallen | self.broken
 
 
@@ -102,6 +104,8 @@ class NavigationTask:
         self._discs = np.full((self.num_rows, 1, 3), np.nan)
         self._moving = np.zeros(self.num_rows, dtype=bool)
         self.observation = np.zeros((self.num_rows, layout.size), dtype=np.float32)
+        self.plan = option.plan.copy()
+        """(N, K, 2) what the skill follows, world frame [m]."""
 
     @property
     def pose(self) -> np.ndarray:
@@ -171,6 +175,7 @@ class NavigationTask:
             fallen=fallen & self.end_on_fall,
             broken=broken,
             option=option,
+            plan=self.plan,
         )
 
     def _observe(self, rows: np.ndarray | None) -> OptionStep:
@@ -181,16 +186,16 @@ class NavigationTask:
         sensors = {name: values[pick] for name, values in self.sim.sensors.items()}
         sensors["lidar"] = lidar_closeness(pose, self._discs[pick])
         time = self.steps[pick] * self.robot.control_period
-        option, _, built = observe(
+        option, plan, built = observe(
             self.option, self.recovery, self.layout, pose, sensors, goal, maps, time, self.sim.time[pick], rows
         )
         if not np.isfinite(built).all():
             built = np.nan_to_num(built)  # a broken row is reported, not passed on
         if rows is None:
-            self.observation = built
+            self.observation, self.plan = built, plan
         else:
-            self.observation = self.observation.copy()
-            self.observation[rows] = built
+            self.observation, self.plan = self.observation.copy(), self.plan.copy()
+            self.observation[rows], self.plan[rows] = built, plan
         return option
 
     def _set_discs(self, row: int, discs: np.ndarray) -> None:

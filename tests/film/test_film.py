@@ -137,9 +137,7 @@ def test_films_of_maps_are_named_after_the_maps_and_none_replaces_another(tmp_pa
 
 def test_the_caption_tells_how_an_episode_ended():
     episodes = [
-        Episode(
-            0, reason == "goal", reason, 9, 10, 0, 0.0, 1.0, 1.0, REPLANS, refused=0, recoveries=0, plan_seconds=0.0
-        )
+        Episode(0, reason == "goal", reason, 9, 10, 0, 0.0, 1.0, 1.0, REPLANS, refused=0, recoveries=0)
         for reason in ("goal", "left_field", "timeout", "fallen", "physics")
     ]
     strips = [caption(LEAST_WIDTH, "world", "step 9", REPLANS, episode) for episode in (None, *episodes)]

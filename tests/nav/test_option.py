@@ -208,12 +208,12 @@ def test_without_a_plan_the_robot_holds_its_position_and_asks_again() -> None:
     drive.planner.silent = True
     assert drive.at((0.4, 0.2)) == [START]
     assert_allclose(drive.option.plan[0], np.broadcast_to([0.4, 0.2], (10, 2)))
-    assert drive.at((0.41, 0.2)) == [START]
+    assert drive.at((0.41, 0.2)) == [NONE], "an end is told once, however often a plan is asked for"
     assert len(drive.planner.queries) == 2 and drive.option.refused[0] == 2
     drive.planner.silent = False
-    assert drive.at((0.41, 0.2)) == [START]
+    assert drive.at((0.41, 0.2)) == [NONE] and drive.option.started[0]
     assert drive.at((0.41, 0.2)) == [NONE]
-    assert drive.option.refused[0] == 2
+    assert len(drive.planner.queries) == 3 and drive.option.refused[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -236,13 +236,13 @@ def test_a_refused_robot_keeps_its_plan_and_asks_again_at_every_step(
     plan = drive.option.plan.copy()
     drive.planner.silent = True
     for count in (1, 2, 3):
-        assert drive.at(position) == [reason]
+        assert drive.at(position) == [reason if count == 1 else NONE]
         assert drive.option.refused[0] == count
         assert_array_equal(drive.option.plan, plan)
         assert_allclose(drive.option.start[0], 0.0)
     drive.planner.silent = False
-    assert drive.at(position) == [reason]
-    assert_allclose(drive.option.start[0], position)
+    assert drive.at((0.05, 0.0)) == [NONE], "where the rule would let the old plan stand"
+    assert_allclose(drive.option.start[0], (0.05, 0.0))
 
 
 def test_a_position_that_is_not_a_number_keeps_the_plan_and_is_not_shown_to_the_planner() -> None:

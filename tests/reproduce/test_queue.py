@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import shutil
@@ -308,6 +309,15 @@ def test_two_queues_do_not_work_on_the_same_cell(places):
         fcntl.flock(file, fcntl.LOCK_EX)
         tally = Queue([cell("a"), cell("b")], places, work).run()
     assert work.calls == ["b"] and "another queue" in tally.skipped["astar/a"]
+
+
+def test_where_there_are_no_locks_a_queue_runs_all_the_same(places, monkeypatch):
+    def unknown(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr(fcntl, "flock", unknown)
+    work = Work()
+    assert not Queue([cell("a")], places, work).run().skipped and work.calls == ["a"]
 
 
 @pytest.mark.parametrize("retry", [False, True])

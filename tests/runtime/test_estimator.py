@@ -324,6 +324,7 @@ def test_no_input_makes_the_state_infinite_or_the_covariance_lopsided(sequence, 
     ("change", "message"),
     [
         ({"gyro_sigma": 0.0}, "gyro_sigma = 0.0"),
+        ({"hold_after": 0}, "hold_after = 0"),
         ({"fix_sigma": math.nan}, "fix_sigma = nan"),
         ({"gate_probability": 1.0}, "gate_probability = 1.0"),
         ({"reinit_after": 1}, "reinit_after = 1"),

@@ -20,7 +20,7 @@ from hiernav.runtime.log_reader import LogError, RunLog
 from hiernav.runtime.observe import Observer, TickRecord
 from hiernav.runtime.policy import OnnxSkill
 from hiernav.runtime.recorder import Recorder
-from hiernav.runtime.replay import ASKED, Replay, _Asked, _Recorded
+from hiernav.runtime.replay import ASKED, Replay, _Asked, _Recorded, _same, _texts
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise
 from hiernav.runtime.supervisor import Mode
@@ -293,3 +293,10 @@ def test_the_lidar_is_dimmed_where_it_was(seed: int) -> None:
         assert (recovery.dim(terms)["lidar"] == replayed.dim(terms)["lidar"]).all()
         dimmed += int((recovery.dim(terms)["lidar"] < 0.5).any())
     assert 0 < dimmed < 600
+
+
+def test_what_is_no_number_is_alike_whatever_its_bits_and_zeros_are_not():
+    nan, zero = np.array([1.0, float("nan")], np.float32), np.array([0.0, 2.0])
+    assert _same(np.array([1.0, float("nan")]), nan) and _same(np.array([1.0, -float("nan")]), nan)
+    assert not _same(np.array([float("nan"), 1.0]), nan)
+    assert not _same(np.array([-0.0, 2.0]), zero) and _texts(np.array([-0.0, 2.0]), zero) == ("-0.0 (element 0)", "0.0")

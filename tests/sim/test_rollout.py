@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,10 +43,6 @@ def capped(layout: Layout, cap: int, seed: int = 0) -> Layout:
     return replace(layout, spec=replace(layout.spec, max_steps=cap), seed=seed)
 
 
-def without_time(episode: Episode) -> dict[str, object]:
-    return {name: value for name, value in asdict(episode).items() if name != "plan_seconds"}
-
-
 def test_every_layout_is_driven_once_and_results_are_in_order() -> None:
     """Layouts of very different caps, more of them than rows: the short ones end first."""
     caps = [40, 5, 17, 60, 3, 9, 26]
@@ -70,7 +66,7 @@ def test_every_step_is_shown_before_a_row_starts_anew() -> None:
 def test_an_episode_does_not_depend_on_what_runs_beside_it(num_rows: int) -> None:
     layouts = [sample_layout(WORLD, seed) for seed in range(4)]
     three, other = run(follow, layouts), run(follow, layouts, num_rows)
-    assert [without_time(episode) for episode in three] == [without_time(episode) for episode in other]
+    assert three == other
 
 
 def test_a_skill_that_follows_waypoints_reaches_goals_on_short_ways() -> None:
@@ -80,7 +76,6 @@ def test_a_skill_that_follows_waypoints_reaches_goals_on_short_ways() -> None:
         assert 0.0 <= episode.spl <= 1.0
         assert episode.replans["start"] == 1
         assert episode.refused == 0
-        assert episode.plan_seconds > 0.0
         if episode.reached:
             assert episode.reason == "goal" and episode.replans["goal"] == 1
             assert episode.spl > 0.7

@@ -12,6 +12,8 @@ from hiernav.nav.frames import body_to_world
 from hiernav.nav.lidar import PILLAR_RADIUS, lidar_closeness
 from hiernav.nav.option import TerminationReason
 from hiernav.sim.factory import make_task
+from hiernav.sim.rollout import run_episodes
+from hiernav.sim.task import TaskStep
 from hiernav.sim.worlds import sample_layout
 
 # rewards by teleporting
@@ -149,12 +151,26 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
 def test_a_planner_that_finds_nothing_does_not_stop_the_task() -> None:
     task = task_of(facing_goal(), planner=Silent())
     step = still(task)
-    assert step.option.reason[0] == TerminationReason.START
+    assert step.option.reason[0] == TerminationReason.NONE and task.option.counts[0, TerminationReason.START] == 1
     assert task.option.refused[0] == 2
     assert np.isfinite(step.reward[0]) and np.isfinite(step.observation).all()
 
 
 # observation
+
+
+def test_the_plan_that_is_told_is_the_one_that_the_skill_sees_also_on_a_way_out() -> None:
+    task, shown = task_of(facing_goal()), []
+    part = task.layout.slices["waypoints"]
+
+    def look(step: TaskStep) -> None:
+        seen = step.observation[:, part].astype(float).reshape(1, -1, 2)
+        assert_allclose(body_to_world(seen, task.pose), step.plan, atol=1e-5)
+        assert step.plan is task.plan
+        shown.append(np.allclose(step.plan, step.option.plan))
+
+    run_episodes(task, lambda seen: np.zeros((1, 2)), [facing_goal()], on_step=look)
+    assert True in shown and False in shown
 
 
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])

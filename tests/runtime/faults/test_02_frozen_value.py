@@ -170,6 +170,17 @@ def test_a_lidar_that_reads_nothing_and_a_gripper_that_is_seldom_used_are_not_fr
     assert all(each.trust is Trust.GOOD for each in errors.estimates)
 
 
+@pytest.mark.parametrize("grain", [0.01, 1.0 / 255.0])
+@pytest.mark.parametrize("speed", [0.2, 0.5])
+def test_a_coarse_lidar_that_leaves_all_obstacles_behind_is_not_frozen(grain, speed):
+    watch, period = TermWatch(), 0.02
+    for k in range(int(7.0 / speed / period)):
+        x = speed * period * k
+        closeness = np.exp(-np.hypot(x + 0.5, [0.3, -0.5, 2.0]))
+        watch.see("lidar", grain * np.round(closeness / grain), k * period, (x, 0.0))
+        assert dict(watch.silences(k * period)) == {"lidar": 0.0}, f"after {x:.2f} m"
+
+
 def test_a_lidar_that_thaws_is_trusted_again_and_watched_further():
     watch, place = TermWatch(), 0.0
 
