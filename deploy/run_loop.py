@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from hiernav.runtime.recorder import Recorder
     from hiernav.view.link import ViewerLink
 
+WORLD = "pillar(2,2,10)"
 BUNDLES = Path(__file__).resolve().parent / "bundles"
 OK, FAULT, BAD_INPUT, BAD_BUNDLE, BAD_GOAL = 0, 1, 2, 3, 4
 PICTURED = 20_000
@@ -125,6 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _tell(arguments)
         if arguments.seed < 0:
             raise ValueError(f"--seed {arguments.seed}, it must not be negative")
+        _require_place(arguments)
         return _dry_run(arguments) if arguments.dry_run else _run(arguments)
     except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
         _complain("interrupted")
@@ -135,6 +137,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError) as error:
         _complain(" ".join(str(error).split()))
         return BAD_GOAL if isinstance(error, GoalError) else BAD_INPUT
+
+
+def _require_place(arguments: argparse.Namespace) -> None:
+    """Fill in the world of a simulated robot. Where a real one is, and where it is to go, must be said.
+
+    Raises:
+        ValueError: it was not.
+    """
+    if arguments.adapter and not arguments.dry_run:
+        if arguments.world is None:
+            raise ValueError("--adapter moves a real robot: name the map it is on (--world office.yaml)")
+        if arguments.goal is None and not arguments.serve and arguments.view is None:
+            raise ValueError(
+                "--adapter moves a real robot: name its --goal X,Y, or --serve or --view and give it later"
+            )
+    arguments.world = arguments.world or WORLD
 
 
 def _join_goal(argv: Sequence[str]) -> list[str]:
@@ -154,7 +172,7 @@ def _parser() -> argparse.ArgumentParser:
     pace.add_argument("--fast", action="store_true", help="as fast as the machine can; the same for the same seed")
     parser.add_argument("--robot", default="point", help="point, car or doggo (point)")
     parser.add_argument("--bundle", type=Path, metavar="DIR", help="exported policies (deploy/bundles/ROBOT)")
-    parser.add_argument("--world", default="pillar(2,2,10)", help="kind of world, or a map's YAML (pillar(2,2,10))")
+    parser.add_argument("--world", help=f"kind of world, or a map's YAML ({WORLD}; with --adapter there is no default)")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next ones count up (0)")
     parser.add_argument("--episodes", type=int, default=1, metavar="N", help="how many worlds to cross (1)")
     parser.add_argument("--goal", metavar="X,Y", help="goal in the world frame [m]; the world's own by default")

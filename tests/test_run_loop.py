@@ -222,10 +222,27 @@ def test_an_adapter_of_another_rate_is_refused_before_it_is_driven(script, able_
     tests = str(Path(__file__).parent / "runtime")
     adapter.write_text(f"import sys\nsys.path.insert(0, {tests!r})\nfrom puck import Puck\nmake = Puck\n")
     arguments = ["--bundle", str(able_bundle), "--adapter", f"{adapter}:make", "--out", str(tmp_path / "out")]
-    assert script.main(arguments) == 3
+    assert script.main([*arguments, "--world", "pillar(2,2,10)", "--goal", "0,0"]) == 3
     assert "control_period_s: 0.02 s in the bundle, 0.1 s on this robot" in capsys.readouterr().err
     assert script.main([*arguments, "--dry-run"]) == 1
     assert "0.1 s on this robot" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "missing"),
+    [
+        ([], "--world"),
+        (["--goal", "1,1"], "--world"),
+        (["--serve"], "--world"),
+        (["--world", "pillar(2,2,0)"], "--goal"),
+    ],
+)
+def test_a_real_robot_is_driven_nowhere_that_nobody_named(script, tmp_path, capsys, monkeypatch, arguments, missing):
+    monkeypatch.setattr(script, "_run", lambda _: pytest.fail("it was begun"))
+    assert script.main(["--adapter", "my_robot.py:make", *arguments, "--out", str(tmp_path)]) == 2
+    assert f"--adapter moves a real robot: name {'the map' if missing == '--world' else 'its --goal'}" in (
+        capsys.readouterr().err
+    )
 
 
 def test_settings_that_are_accepted_are_obeyed(script, able_bundle, tmp_path):
@@ -298,7 +315,7 @@ def test_what_a_loop_answers_is_printed_and_decides_the_exit_code(script, monkey
 def test_a_file_of_settings_takes_nothing_away_from_the_robot_s_own(script, tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text("estimator: {gyro_sigma: 0.05}\n")
-    arguments = script._parser().parse_args(["--robot", "doggo", "--settings", str(own)])
+    arguments = script._parser().parse_args(["--robot", "doggo", "--world", "gremlin", "--settings", str(own)])
     settings = script._settings(arguments, script.get_robot("doggo"))
     assert settings.estimator.gyro_sigma == 0.05 and settings.guard.tilt_limit == 1.31
 
@@ -309,7 +326,7 @@ def test_a_robot_that_can_fall_has_a_limit_of_its_tilt_also_where_its_file_is_mi
 ):
     """The script may have been copied alone."""
     monkeypatch.setattr(script, "__file__", str(tmp_path / "run_loop.py"))
-    asked = ["--robot", robot, "--set", "guard.slew_limit=0.3"]
+    asked = ["--world", "gremlin", "--robot", robot, "--set", "guard.slew_limit=0.3"]
     settings = script._settings(script._parser().parse_args(asked), script.get_robot(robot))
     assert (settings.guard.tilt_limit, settings.guard.slew_limit) == (limit, 0.3)
 

@@ -90,7 +90,10 @@ class FaultWatch(Observer):
 
     def event(self, event: Event) -> None:
         mode = event.values.get("mode")
-        if mode == Mode.FAULT.value:
+        if event.kind == "fault":
+            fault = self.account.add_fault(event.text, event.time)
+            self.open = self.open or fault
+        elif mode == Mode.FAULT.value:
             self.open = self.account.add_fault(event.text, event.time)
         elif mode == Mode.INIT.value and self.open is not None:  # out of FAULT and ESTOP nothing else leads there
             self.open.acknowledged, self.open = True, None

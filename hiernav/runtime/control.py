@@ -104,6 +104,7 @@ def describe(driver: Driver) -> dict[str, Any]:
         "mode": driver.supervisor.mode.value,
         "why": driver.supervisor.why,
         "fault": driver.supervisor.fault,
+        "paused": driver.paused,
         "goal": None if goal is None else goal.tolist(),
         "pose": None if estimate is None else estimate.pose.tolist(),
         "speed": None if estimate is None else math.hypot(*estimate.velocity.tolist()),

@@ -68,9 +68,12 @@ class DriverConfig:
     hold_timeout: float = 10.0
     """Waiting longer than this is a fault, unless somebody paused the robot [s]."""
     stop_speed: float = 0.1
-    """A robot slower than this, three readings in a row, has stopped [m/s]."""
+    """A robot slower than this, and than `stop_turn`, stands [m/s]."""
+    stop_turn: float = 1.0
+    """A robot that turns slower than this, and is slower than `stop_speed`, stands [rad/s]. The simulated point, whose
+    heading is held by a stiff servo, shivers at 0.5 where it stands."""
     stop_timeout: float = 3.0
-    """Time the robot is given to stop [s]."""
+    """Time the robot is given to stop once it is braked, and whenever it moves again [s]."""
     max_recoveries: int = 20
     """Recoveries on the way to one goal after which the robot is stuck, wherever they were."""
     predict: bool = True
@@ -253,6 +256,11 @@ class Driver:
         return None if self._trip is None else self._trip.goal
 
     @property
+    def paused(self) -> bool:
+        """Whether it waits for `resume`, with a goal or without."""
+        return self._paused
+
+    @property
     def last_trip(self) -> Trip | None:
         """The goal that ended last, whether the robot has been seen to stand since or not."""
         return self._last_trip
@@ -287,7 +295,8 @@ class Driver:
         self._plans = PlanWatch(config.plan_slow, config.plan_hold)
         self._no_way = BlockedWatch(0.0, config.no_way_at_start)
         self._saturation = SaturationWatch(self.robot.action_dim, self.robot.control_period)
-        self._standing = StopWatch(config.stop_speed, config.stop_timeout)
+        self._standing = StopWatch(config.stop_speed, config.stop_turn, config.stop_timeout)
+        self._acknowledged = False
         self.estimator.reset()
         self.last_result = None
         _warm_up(self.estimator.config)
@@ -476,6 +485,10 @@ class Driver:
     def _choose_mode(self, trip: Trip, decision: Decision | None, wait: str | None, stamp: float, now: float) -> None:
         """What the robot may do in this tick, `wait` being why it must not move, if so."""
         supervisor = self.supervisor
+        if self._acknowledged and self._standing.stands:
+            self._acknowledged = False
+        if self._acknowledged:
+            wait = "the robot has not been seen to stand since the fault"
         if self._paused:
             wait, self._held_since = "paused", now
         self._plan_speed = 1.0
@@ -616,7 +629,8 @@ class Driver:
         self._fail(f"the robot does not stop within {self.config.stop_timeout:g} s", now)
 
     def _fail(self, why: str, now: float) -> None:
-        self.supervisor.fail(why, now)
+        if self.supervisor.fail(why, now):
+            self._emit("fault", why, now)
         self._end_trip("fault", now, why)
 
     def _estop(self, why: str, now: float) -> None:
@@ -631,6 +645,8 @@ class Driver:
         self.guard.reset()
         self.pilot.renew()
         self._blind.renew(now)
+        self._standing.begin(now)
+        self._acknowledged = True
 
     def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         self.audience.emit(kind, text, now, **values)
@@ -697,7 +713,7 @@ class Driver:
 
     def _stop(self) -> bool:
         """Brake until the measured speed shows that the robot stands; False if it could not be shown in time."""
-        watch = StopWatch(self.config.stop_speed, self.config.stop_timeout)
+        watch = StopWatch(self.config.stop_speed, self.config.stop_turn, self.config.stop_timeout)
         watch.begin(self.clock.now())
         stopped: bool | None = None
 

@@ -16,6 +16,8 @@ from rich.table import Table
 from hiernav.nav.bundle import Bundle
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
+from hiernav.runtime.guard import Guard
+from hiernav.runtime.pilot import GUIDES
 from hiernav.runtime.policy import check_golden, load_policies, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
@@ -23,6 +25,9 @@ from hiernav.runtime.robot import READINGS, SIZES, SensorFrame
 from hiernav.runtime.settings import Settings
 from hiernav.runtime.timing import Histogram
 
+LOOK = 2.5
+"""For how long a robot is listened to [s]: longer than its fixes may stay away."""
+ESTIMATOR_NEEDS = ("position_fix", "magnetometer")
 WAKES = 200
 PERIOD = 0.005
 
@@ -38,7 +43,7 @@ def report(
         return _check_bundle(bundle[0])
 
     found: dict[str, Any] = {"bundle": _attempt(check_bundle)}
-    found["robot"] = _attempt(lambda: _check_robot(make_robot(), bundle[0] if bundle else None))
+    found["robot"] = _attempt(lambda: _check_robot(make_robot(), bundle[0] if bundle else None, settings))
     found["estimator"] = _attempt(_check_filter)
     found["host"] = _check_host(settings)
     return found
@@ -74,35 +79,71 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _check_robot(robot: ProcessRobot, bundle: Bundle | None) -> dict[str, Any]:
+def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings) -> dict[str, Any]:
     if bundle is not None:
         require_fit(bundle, robot)
-    frame = robot.read()
-    present = [name for name in READINGS if getattr(frame, name) is not None]
-    absent = [name for name in READINGS if name not in present]
-    wrong = _wrong_sizes(frame, bundle)
-    broken = [name for name in present if not np.isfinite(getattr(frame, name)).all()]
+    frames = _look(robot)
+    given: dict[str, list[np.ndarray]] = {}
+    for frame in frames:
+        for name, value in _readings(frame).items():
+            given.setdefault(name, []).append(np.asarray(value, dtype=np.float64))
+    needed = [*ESTIMATOR_NEEDS, *(() if bundle is None else (n for n in bundle.layout.names if n not in GUIDES))]
+    silent = [name for name in dict.fromkeys(needed) if name not in given]
+    broken = [name for name, values in given.items() if not any(np.isfinite(value).all() for value in values)]
+    stamps = np.array([frame.stamp for frame in frames])
+    errors = [f"silent for {LOOK:g} s: {', '.join(silent)}"] if silent else []
+    errors += [f"never finite: {', '.join(broken)}"] if broken else []
+    if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0.0).any()):
+        errors.append(f"stamps do not advance: {stamps[0]:g} to {stamps[-1]:g} s")
+    lidar = np.concatenate([np.ravel(value) for value in given.get("lidar", [])] or [np.zeros(1)])
+    if (lidar < 0.0).any() or (lidar > 1.0).any():
+        errors.append(f"lidar reads {lidar.min():g} to {lidar.max():g}, closeness in [0, 1] is expected")
+    wrong = _wrong_sizes({name: values[-1] for name, values in given.items()}, bundle)
+    errors += [f"sensors of another size: {', '.join(wrong)}"] if wrong else []
+    try:
+        Guard(robot.action_dim, settings.guard)
+    except ValueError as error:
+        errors.append(str(error))
+    absent = [name for name in READINGS if name not in given]
     return {
         "control period": f"{1e3 * robot.control_period:g} ms",
         "actuators": robot.action_dim,
-        "sensors": ", ".join([*present, *frame.extra]) or "missing",
+        "frames": f"{len(frames)} in {LOOK:g} s",
+        "sensors": ", ".join(given) or "missing",
         "silent": f"missing: {', '.join(absent)}" if absent else "none",
         "not finite": f"missing: {', '.join(broken)}" if broken else "none",
-        **({"error": f"sensors of another size: {', '.join(wrong)}"} if wrong else {}),
+        **({"error": "; ".join(errors)} if errors else {}),
         **{f"adapter {name}": text for name, text in robot.realtime.items()},
     }
 
 
-def _wrong_sizes(frame: SensorFrame, bundle: Bundle | None) -> list[str]:
+def _look(robot: ProcessRobot) -> list[SensorFrame]:
+    """The frames that a robot shows in LOOK seconds."""
+    clock = MonotonicClock()
+    frames, end = [robot.read()], clock.now() + LOOK
+    while clock.now() < end:
+        clock.sleep_until(min(clock.now() + robot.control_period, end))
+        frame = robot.read()
+        if frame is not frames[-1]:
+            frames.append(frame)
+    return frames
+
+
+def _readings(frame: SensorFrame) -> dict[str, np.ndarray]:
+    """What a frame has, by name."""
+    present = {name: getattr(frame, name) for name in READINGS}
+    return {name: value for name, value in (present | dict(frame.extra)).items() if value is not None}
+
+
+def _wrong_sizes(given: Mapping[str, np.ndarray], bundle: Bundle | None) -> list[str]:
     """Each sensor that gives more or fewer values than estimator and skill take."""
     sizes = dict(SIZES)
     if bundle is not None:
         sizes |= {term.name: term.size for term in bundle.layout.terms}
-    given = {name: getattr(frame, name) for name in READINGS} | dict(frame.extra)
     return [
         f"{name} has {np.size(value)} values, {sizes[name]} are expected"
         for name, value in given.items()
-        if value is not None and np.size(value) != sizes.get(name, np.size(value))
+        if np.size(value) != sizes.get(name, np.size(value))
     ]
 
 

@@ -159,6 +159,7 @@ class Estimator:
             return None
         self._flaws.pop(name, None)
         if self._watch.repetition(name, self._stamp) >= self.config.hold_after:
+            self._flaws[name] = "repeats itself"
             self.counts[f"{name}_frozen"] += 1
             return None
         if name == "accelerometer":  # what it says is weighed, never rejected
@@ -340,6 +341,7 @@ class Estimator:
         self._watch.see("position_fix", tuple(fix), stamp)
         if self._watch.repetition("position_fix", stamp) >= self.config.hold_after:
             self.counts["position_fix_frozen"] += 1
+            self._flaws["position_fix"] = "repeats itself"
             return
         then = self._position_at(stamp)
         miss = (fix[0] - then[0], fix[1] - then[1])
@@ -451,12 +453,12 @@ class Estimator:
             if trust > worst:
                 flaw = self._flaws.get(name)
                 worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
-        for name, silence in self._terms.silences(self._stamp):
+        for name, silence, flaw in self._terms.silences(self._stamp):
             if silence < self.config.hold_after:
                 continue
             trust = Trust.LOST if silence >= self.config.lost_after else Trust.HOLD
             if trust > worst:
-                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s"
+                worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
         return worst, why
 
     def _estimate(self) -> Estimate:

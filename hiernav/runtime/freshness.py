@@ -147,6 +147,10 @@ class SensorWatch:
 class _Term:
     heard: float
     """When it last said something that the skill can use [s]."""
+    size: int = 0
+    """Number of values of the first reading, which all others must have."""
+    flaw: str = ""
+    """What is wrong with what it says now."""
     reading: bytes = b""
     """The last one, to the bit."""
     new: float = -math.inf
@@ -177,7 +181,7 @@ class TermWatch:
         """The robot's clock is another one from `stamp` [s] on: forget all readings, not which sensors repeat them."""
         for name, term in self._terms.items():
             longest = max(term.longest, term.lasted)
-            self._terms[name] = _Term(stamp, longest=longest, repeats_itself=term.repeats_itself)
+            self._terms[name] = _Term(stamp, term.size, longest=longest, repeats_itself=term.repeats_itself)
 
     def see(self, name: str, value: np.ndarray, stamp: float, place: tuple[float, float]) -> None:
         """Take note of a reading at `stamp` [s].
@@ -191,7 +195,12 @@ class TermWatch:
         term = self._terms.get(name)
         if term is None:
             term = self._terms[name] = _Term(stamp)
+        term.flaw, term.size = "", term.size or np.size(value)
         if not is_sound(name, value):
+            term.flaw = "not finite, or absurd" if name != "lidar" else "not in [0, 1]: closeness is expected"
+        elif np.size(value) != term.size:
+            term.flaw = f"{np.size(value)} values instead of {term.size}"
+        if term.flaw:
             return
         reading = np.asarray(value).tobytes()
         if reading != term.reading:
@@ -202,13 +211,13 @@ class TermWatch:
             way = math.dist(place, term.place)
             if way > max(TRAVEL, SPARE * term.longest):
                 if term.changes > LEARN:
-                    term.heard = min(term.heard, term.new)
+                    term.heard, term.flaw = min(term.heard, term.new), "repeats itself"
                     return
                 term.repeats_itself = True
             term.lasted = max(term.lasted, way)
         term.heard = stamp
 
-    def silences(self, stamp: float) -> Iterator[tuple[str, float]]:
-        """Each sensor, and for how long it has said nothing that can be used [s]."""
+    def silences(self, stamp: float) -> Iterator[tuple[str, float, str]]:
+        """Each sensor, for how long it has said nothing that can be used [s], and what is wrong with what it says."""
         for name, term in self._terms.items():
-            yield name, stamp - term.heard
+            yield name, stamp - term.heard, term.flaw

@@ -199,6 +199,10 @@ class Adapter:
 
     def _publish(self) -> None:
         frame = self.robot.read()
+        if not isinstance(frame, SensorFrame):
+            raise TypeError(
+                f"read() returned {type(frame).__name__}, expected a SensorFrame; what is missing is None in it"
+            )
         if frame is self._shown:
             return
         self._shown = frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
@@ -44,6 +45,10 @@ TRANSITIONS: dict[Mode, frozenset[Mode]] = {
 """Out of FAULT and ESTOP leads only `Supervisor.acknowledge`, to INIT."""
 
 
+REASONS = 5
+"""Of one latched mode."""
+
+
 class InvalidTransition(RuntimeError):
     """A change of mode that the table does not allow."""
 
@@ -59,6 +64,8 @@ class Supervisor:
         """Why it is in this mode."""
         self.fault: str | None = None
         """Why it is in FAULT or ESTOP."""
+        self._kinds: list[str] = []
+        """Of the reasons in `fault`."""
         self.history: deque[tuple[float, Mode, str]] = deque(maxlen=256)
         """Last changes: time [s], mode entered, why."""
 
@@ -83,12 +90,24 @@ class Supervisor:
             raise InvalidTransition(f"{self.mode.name} -> {mode.name} ({why}); allowed: {allowed}")
         if mode in LATCHED:
             self.fault = why
+            self._kinds = [_kind(why)]
         self._enter(mode, why, now)
 
-    def fail(self, why: str, now: float) -> None:
-        """Enter FAULT from wherever that is possible; where one has latched already, its reason is kept."""
+    def fail(self, why: str, now: float) -> bool:
+        """Enter FAULT from wherever that is possible; where one has latched already, another reason joins its own.
+
+        Returns:
+            Whether it has joined: reasons that differ in their numbers alone do so once, and REASONS of them at most.
+        """
         if not self.latched:
             self.change(Mode.FAULT, why, now)
+            return False
+        kind = _kind(why)
+        if kind in self._kinds or len(self._kinds) >= REASONS:
+            return False
+        self._kinds.append(kind)
+        self.why = self.fault = f"{self.fault}; {why}"
+        return True
 
     def stop(self, why: str, now: float) -> None:
         """Enter ESTOP from anywhere."""
@@ -111,3 +130,7 @@ class Supervisor:
         self.history.append((now, mode, why))
         if self._changed is not None:
             self._changed(now, mode, why)
+
+
+def _kind(why: str) -> str:
+    return re.sub(r"[0-9.]+", "", why)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hiernav.runtime.robot import ABSURD, SensorFrame
+from hiernav.runtime.robot import ABSURD, SIZES, SensorFrame
 
 _LIMIT = ABSURD * ABSURD
 
@@ -26,16 +26,16 @@ class TermHold:
     def fill(self, frame: SensorFrame) -> dict[str, np.ndarray]:
         """Terms by name, (1, d) each, after taking in a frame; once per tick.
 
-        A component that was never good reads zero, a sensor never seen is absent.
+        A component that was never good reads zero. A reading of another size than the first, or than its sensor's, is
+        none; a sensor without any is absent.
         """
         last = self._last
         for name, value in frame.terms().items():
-            value = np.asarray(value, dtype=np.float64).reshape(1, -1)
+            value, before = np.asarray(value, dtype=np.float64).reshape(1, -1), last.get(name)
+            if value.size != (SIZES.get(name, value.size) if before is None else before.size):
+                continue
             if not is_sound(name, value):
                 good = (0.0 <= value) & (value <= 1.0) if name == "lidar" else np.abs(value) < ABSURD
-                before = last.get(name)
-                if before is None or before.shape != value.shape:
-                    before = np.zeros_like(value)
-                value = np.where(good, value, before)
+                value = np.where(good, value, 0.0 if before is None else before)
             last[name] = value
         return dict(last)

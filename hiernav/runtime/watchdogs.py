@@ -148,43 +148,59 @@ class SaturationWatch:
         return len(self._counts) == self._counts.maxlen and self._sum >= self._limit
 
 
-class StopWatch:
-    """Decides from measured speeds whether a braked robot stands."""
+SETTLED = 0.2
+"""For how long a robot's speed must say the same before it is believed to stand, or to move again [s]."""
 
-    def __init__(self, speed: float, timeout: float, readings: int = 3) -> None:
+
+class StopWatch:
+    """Decides from measured speeds whether a braked robot stands, and goes on watching that it does."""
+
+    def __init__(self, speed: float, turn: float, timeout: float) -> None:
         """
         Args:
-            speed: a robot slower than this stands [m/s].
-            timeout: time it is given to stop [s].
-            readings: slow ones in a row that are needed.
+            speed, turn: a robot slower than both stands [m/s, rad/s].
+            timeout: time it is given to stop, at first and whenever it moves again [s].
         """
-        self.speed, self.timeout, self.readings = speed, timeout, readings
-        self._since: float | None = None
-        self._slow = 0
-        self._stamp = math.nan
+        self.speed, self.turn, self.timeout = speed, turn, timeout
+        self.stands = True
+        """Whether it was seen to stand since the brake was first sent, and has not moved since."""
+        self._watching = self._told = self._slow = False
+        self._since, self._alike = 0.0, 0
+        self._stamp = self._since_stamp = math.nan
 
     def begin(self, now: float) -> None:
         """The brake was first sent at `now` [s]."""
-        self._since, self._slow = now, 0
+        self._watching, self.stands = True, False
+        self._told, self._since = False, now
+        self._alike, self._stamp = 0, math.nan
 
     def check(self, estimate: Estimate | None, now: float, measured: bool = True) -> bool | None:
         """Whether the robot stands; None while that is open, and after it was told once.
+
+        One reading of a speed that passes through zero, or an odd one of a robot that stands, says nothing: it takes
+        three, over 0.2 s.
 
         Args:
             estimate: newest; one that was seen before says nothing.
             now: on the loop's clock [s].
             measured: whether its speed is one that a sensor says, and not the last one that was known.
         """
-        if self._since is None:
+        if not self._watching:
             return None
-        if estimate is None or not math.hypot(*estimate.velocity.tolist()) < self.speed:
-            self._slow = 0
-        elif measured and estimate.stamp != self._stamp:
-            self._slow, self._stamp = self._slow + 1, estimate.stamp
-        if self._slow >= self.readings:
-            self._since = None
-            return True
-        if now - self._since > self.timeout:
-            self._since = None
+        if measured and estimate is not None and estimate.stamp != self._stamp:
+            self._take(estimate)
+            if self._alike >= 3 and estimate.stamp - self._since_stamp >= SETTLED and self._slow is not self.stands:
+                self.stands = self._slow
+                if self.stands:
+                    return True
+                self._since, self._told = now, False
+        if not (self.stands or self._told) and now - self._since > self.timeout:
+            self._told = True
             return False
         return None
+
+    def _take(self, estimate: Estimate) -> None:
+        slow = math.hypot(*estimate.velocity.tolist()) < self.speed and abs(estimate.yaw_rate) < self.turn
+        if slow is not self._slow or not estimate.stamp >= self._stamp:
+            self._slow, self._alike, self._since_stamp = slow, 0, estimate.stamp
+        self._alike, self._stamp = self._alike + 1, estimate.stamp

@@ -335,7 +335,7 @@ def test_a_robot_that_was_not_seen_to_stand_ends_with_code_1(serve, monkeypatch,
     (episode,) = summary["episodes"]
     assert (code, episode["reason"], episode["stopped"]) == (0 if seen else 1, "estop", seen)
     told = [fault["why"] for fault in summary["faults"]["newest"]]
-    assert told == ([] if seen else ["the robot was not seen to stand"])
+    assert told == ([] if seen else ["the robot does not stop within 3 s"])
 
 
 def test_a_loop_that_listens_already_or_a_page_that_fails_spends_no_recording_s_name(serve, run, tmp_path, monkeypatch):

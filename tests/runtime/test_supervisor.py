@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hiernav.runtime.supervisor import TRANSITIONS, InvalidTransition, Mode, Supervisor
+from hiernav.runtime.supervisor import REASONS, TRANSITIONS, InvalidTransition, Mode, Supervisor
 
 
 def supervisor_in(*path: Mode) -> Supervisor:
@@ -40,13 +40,17 @@ def test_nothing_runs_that_was_not_armed():
 
 
 @pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.ESTOP])
-def test_a_fault_is_possible_anywhere_and_latches_with_its_first_reason(mode):
+def test_a_fault_is_possible_anywhere_and_latches_with_its_reasons(mode):
     supervisor = Supervisor()
     supervisor.mode = mode
-    supervisor.fault = "first" if mode is Mode.FAULT else None
-    supervisor.fail("first", 1.0)
-    supervisor.fail("second", 2.0)
-    assert (supervisor.mode, supervisor.fault) == (Mode.FAULT, "first")
+    if mode is Mode.FAULT:
+        supervisor.mode = Mode.INIT
+        supervisor.fail("first after 0.5 s", 0.5)
+    assert not supervisor.fail("first after 0.5 s", 1.0)
+    assert [supervisor.fail(why, 2.0) for why in ("second", "first after 0.75 s", "second")] == [True, False, False]
+    assert (supervisor.mode, supervisor.fault) == (Mode.FAULT, "first after 0.5 s; second")
+    assert supervisor.why == supervisor.fault
+    assert sum(supervisor.fail("x" * k, 2.5) for k in range(1, 100)) == REASONS - 2
     for wish in set(Mode) - {Mode.ESTOP}:
         with pytest.raises(InvalidTransition):
             supervisor.change(wish, "test", 3.0)
@@ -57,12 +61,12 @@ def test_a_fault_is_possible_anywhere_and_latches_with_its_first_reason(mode):
 @pytest.mark.parametrize("mode", list(Mode))
 def test_an_emergency_stop_is_possible_anywhere_and_latches(mode):
     supervisor = Supervisor()
-    supervisor.mode = mode
-    supervisor.fault = "pressed" if mode is Mode.ESTOP else None
+    supervisor.mode = Mode.INIT if mode is Mode.ESTOP else mode
     supervisor.stop("pressed", 1.0)
     supervisor.stop("pressed again", 2.0)
-    supervisor.fail("something else", 3.0)
     assert (supervisor.mode, supervisor.fault) == (Mode.ESTOP, "pressed")
+    assert supervisor.fail("something else", 3.0)
+    assert (supervisor.mode, supervisor.fault) == (Mode.ESTOP, "pressed; something else")
     for wish in Mode:
         with pytest.raises(InvalidTransition):
             supervisor.change(wish, "test", 3.0)

@@ -75,3 +75,20 @@ def test_a_rehearsal_puts_up_with_sensors_that_miss_frames():
     estimate, occupancy = estimator.update(frame), layout.occupancy(0.0)
     for each in (replace(frame, lidar=None), frame, replace(frame, lidar=None)):
         rehearsal(each, estimate, layout.goal, occupancy)
+
+
+@pytest.mark.parametrize(("sensor", "size"), [("gyro", 4), ("lidar", 9)])
+@pytest.mark.parametrize("ticks", [1, 99])
+def test_a_reading_of_another_size_is_none_and_only_many_of_them_are_a_fault(sensor, size, ticks):
+    seen = Memory()
+
+    def damage(frame: SensorFrame) -> SensorFrame:
+        wrong = 0.5 <= frame.stamp < 0.5 + 0.02 * ticks - 0.01
+        return replace(frame, **{sensor: np.full(size, 0.5)}) if wrong else frame
+
+    result = drive(seen, damage=damage)
+    if ticks == 1:
+        assert result.reached and result.fault is None and not result.holds
+    else:
+        assert f"{sensor} says nothing usable" in result.fault
+        assert f"({size} values instead of {10 if sensor == 'lidar' else 3})" in result.fault

@@ -178,7 +178,7 @@ def test_a_coarse_lidar_that_leaves_all_obstacles_behind_is_not_frozen(grain, sp
         x = speed * period * k
         closeness = np.exp(-np.hypot(x + 0.5, [0.3, -0.5, 2.0]))
         watch.see("lidar", grain * np.round(closeness / grain), k * period, (x, 0.0))
-        assert dict(watch.silences(k * period)) == {"lidar": 0.0}, f"after {x:.2f} m"
+        assert list(watch.silences(k * period)) == [("lidar", 0.0, "")], f"after {x:.2f} m"
 
 
 def test_a_lidar_that_thaws_is_trusted_again_and_watched_further():
@@ -186,7 +186,9 @@ def test_a_lidar_that_thaws_is_trusted_again_and_watched_further():
 
     def silence(stamp: float, reading: float) -> float:
         watch.see("lidar", np.full(10, reading), stamp, (place, 0.0))
-        return dict(watch.silences(stamp))["lidar"]
+        ((name, silent, flaw),) = watch.silences(stamp)
+        assert name == "lidar" and (flaw == "repeats itself") == (silent > 0.0)
+        return silent
 
     for k in range(20):
         assert silence(0.1 * k, 0.01 * k) == 0.0
@@ -196,4 +198,4 @@ def test_a_lidar_that_thaws_is_trusted_again_and_watched_further():
         assert silence(begin + 0.5, 0.5 / begin) == pytest.approx(0.5)
         assert silence(begin + 0.6, 0.6) == 0.0
     watch.begin_again(0.0)
-    assert dict(watch.silences(0.3)) == {"lidar": 0.3}
+    assert list(watch.silences(0.3)) == [("lidar", 0.3, "")]

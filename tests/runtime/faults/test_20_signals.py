@@ -112,7 +112,7 @@ def test_a_signal_to_all_processes_ends_them_in_order_and_the_robot_is_braked_an
     log, adapter = tmp_path / "log", write_adapter(tmp_path / "log", tmp_path / "adapter.py")
     command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
     process = subprocess.Popen(
-        [*command, "--adapter", f"{adapter}:make", "--out", str(tmp_path / "out")],
+        [*command, "--adapter", f"{adapter}:make", "--world", "pillar(2,2,10)", "--out", str(tmp_path / "out")],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None

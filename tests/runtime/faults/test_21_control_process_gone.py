@@ -124,6 +124,7 @@ def test_a_service_whose_adapter_dies_ends_with_code_1_so_that_it_is_started_aga
     log, out = tmp_path / "log", tmp_path / "out"
     adapter = write_adapter(log, tmp_path / "adapter.py")
     command = [sys.executable, str(RUN_LOOP), "--serve", "--control", str(tmp_path / "socket"), "--no-pictures"]
+    command += ["--world", "pillar(2,2,10)"]
     service = subprocess.Popen(
         [*command, "--planner", "sync", "--adapter", f"{adapter}:make", "--out", str(out)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
