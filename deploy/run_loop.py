@@ -43,6 +43,7 @@ from rich.console import Console
 from hiernav import __version__
 from hiernav.decode import ConfigError
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.runtime.account import KEPT, Account, FaultWatch, GoalWatch
 from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
@@ -65,7 +66,7 @@ from hiernav.runtime.settings import Settings, load_settings
 from hiernav.runtime.summary import print_summary, summarise
 from hiernav.runtime.supervisor import Mode
 from hiernav.runtime.trip import RunResult
-from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
+from hiernav.sim.layout import Layout, WorldSpec, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.worlds import sample_layout
 

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from hiernav.nav.search import PathField
     from hiernav.runtime.policy import make_agent
     from hiernav.sim.batch import BatchSim
+    from hiernav.sim.layout import parse_world
     from hiernav.sim.robots import get_robot
-    from hiernav.sim.worlds import parse_world, sample_layout
+    from hiernav.sim.worlds import sample_layout
 
 _HOME = {
     "ConfigError": "hiernav.config",
@@ -46,7 +47,7 @@ _HOME = {
     "make_agent": "hiernav.runtime.policy",
     "BatchSim": "hiernav.sim.batch",
     "get_robot": "hiernav.sim.robots",
-    "parse_world": "hiernav.sim.worlds",
+    "parse_world": "hiernav.sim.layout",
     "sample_layout": "hiernav.sim.worlds",
 }
 

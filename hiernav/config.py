@@ -246,7 +246,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 LONGEST_PLAN = 10.0
-"""`WaypointOption.max_reach` [m]."""
+"""`hiernav.nav.option.LONGEST_PLAN` [m]."""
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "planner": {

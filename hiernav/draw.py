@@ -10,14 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.lidar import PILLAR_RADIUS
-from hiernav.sim.layout import (
-    GOAL_RADIUS,
-    GREMLIN_HALF_SIZE,
-    GREMLIN_ORBIT,
-    Layout,
-    wall_boxes,
-)
+from hiernav.sim.layout import GREMLIN_HALF_SIZE, GREMLIN_ORBIT, Layout, wall_boxes
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

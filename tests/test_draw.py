@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from hiernav.draw import OBSTACLE, draw_layout, field_picture
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.layout import parse_world
+from hiernav.sim.worlds import sample_layout
 
 COLLISION_BGR = (0x24, 0x24, 0xE0)
 PATH_BGR = (0xB0, 0x6C, 0x2B)

@@ -22,8 +22,9 @@ from hiernav.planner.train import load_network  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
 from hiernav.runtime.policy import check_golden, load_policies, make_agent  # noqa: E402
 from hiernav.sim.factory import make_task  # noqa: E402
+from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.robots import get_robot  # noqa: E402
-from hiernav.sim.worlds import parse_world, sample_layout  # noqa: E402
+from hiernav.sim.worlds import sample_layout  # noqa: E402
 from hiernav.skill.train import load_actor  # noqa: E402
 
 pytestmark = pytest.mark.train

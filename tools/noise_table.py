@@ -37,19 +37,19 @@ sys.path.insert(0, str(ROOT))
 from bad_input import exit_code, whole  # noqa: E402
 
 from hiernav.nav.bundle import Bundle, load_bundle  # noqa: E402
-from hiernav.nav.occupancy import OccupancyMap  # noqa: E402
-from hiernav.nav.option import PlanQuery, kept  # noqa: E402
+from hiernav.nav.goal import GOAL_RADIUS  # noqa: E402
 from hiernav.runtime.clock import FakeClock  # noqa: E402
+from hiernav.runtime.delayed_planner import DelayedPlanner  # noqa: E402
 from hiernav.runtime.driver import Driver  # noqa: E402
 from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig  # noqa: E402
 from hiernav.runtime.guard import Guard  # noqa: E402
 from hiernav.runtime.noise import EXACT  # noqa: E402
-from hiernav.runtime.pilot import Answer, Pilot  # noqa: E402
+from hiernav.runtime.pilot import Pilot  # noqa: E402
 from hiernav.runtime.policy import load_policies, make_agent, make_planner  # noqa: E402
 from hiernav.runtime.robot import SensorFrame  # noqa: E402
 from hiernav.runtime.settings import Settings, load_settings  # noqa: E402
 from hiernav.runtime.sim_robot import SimRobot  # noqa: E402
-from hiernav.sim.layout import GOAL_RADIUS, parse_world  # noqa: E402
+from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.robots import RobotSpec, get_robot  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
 
@@ -115,38 +115,6 @@ class RawEstimator:
         )
 
 
-class LatePlanner:
-    """Answers one question at a time, each some time after it was asked, on the simulated clock."""
-
-    failed = None
-
-    def __init__(self, planner: Any, clock: FakeClock, delay: float) -> None:
-        self._planner, self._clock, self._delay = planner, clock, delay
-        self.stamp = 0.0
-        self.forget()
-
-    def plan(self, query: PlanQuery) -> None:
-        if self._asked is None:
-            self._asked = (self._clock.now(), self.stamp, kept(query))
-
-    def answer(self, now: float) -> Answer | None:
-        if self._asked is None or now < self._asked[0] + self._delay - 1e-9:
-            return None
-        (_, stamp, query), self._asked = self._asked, None
-        plan = np.asarray(self._planner.plan(query), dtype=np.float64)[0]
-        occupancy: OccupancyMap = query.occupancy[0]
-        return Answer(plan, query.position[0], stamp, occupancy)
-
-    def forget(self) -> None:
-        self._asked: tuple[float, float, PlanQuery] | None = None
-
-    def restart_count(self) -> int:
-        return 0
-
-    def renew(self) -> None:
-        pass
-
-
 @cache
 def _bundle(path: str) -> Bundle:
     return load_bundle(path)
@@ -184,7 +152,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
     link = None
     if case != NOISE_FREE:
         network = load_policies(bundle).planner
-        link = LatePlanner(make_planner(bundle, network, spec.radius), clock, 1e-3 * case.planner_ms)
+        link = DelayedPlanner(make_planner(bundle, network, spec.radius), 1e-3 * case.planner_ms)
     robot = SimRobot(spec, layouts[0], noise, seeds[0])
     driver = Driver(
         robot,

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from hiernav.draw import FLOOR, GOAL, GREMLIN, OBSTACLE, PATH, PLAN
 from hiernav.film.gl import no_gl
 from hiernav.film.top_view import Frame, rgb
-from hiernav.sim.layout import GOAL_RADIUS
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.sim.task import NavigationTask, TaskStep
 
 _DISTANCE = 12.0  # of the camera, in planning radii

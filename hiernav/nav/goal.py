@@ -8,6 +8,9 @@ import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
 
+GOAL_RADIUS = 0.3
+"""A goal within this distance is reached [m]."""
+
 
 class GoalRefused(ValueError):
     """A goal that cannot be driven to, with a code for machines."""

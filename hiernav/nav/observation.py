@@ -75,6 +75,9 @@ _BASE = (
 _WAYPOINTS = ObservationTerm("waypoints", 20, "m, body frame", 2.0)
 _WORLD_WAYPOINTS = ObservationTerm("world_waypoints", 20, "m, world frame", 0.5)
 _GOAL = ObservationTerm("goal", 2, "m, body frame", 0.5)
+WAYPOINT_GUIDES = (_WAYPOINTS.name, _WORLD_WAYPOINTS.name)
+GUIDES = (*WAYPOINT_GUIDES, _GOAL.name, "clock")
+"""Terms that the agent adds to those of the robot's sensors."""
 CLOCK_HZ = 3.0
 """Frequency of the gait clock: about that of the fastest gaits of the quadruped under open-loop sinusoids."""
 _CLOCK = ObservationTerm("clock", 2, f"sine and cosine of {CLOCK_HZ:g} Hz", 1.0)

@@ -16,6 +16,7 @@ import numpy as np
 
 from hiernav.nav import path
 from hiernav.nav.frames import world_to_body
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import ObservationLayout, clock_phase
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.prediction import MapPredictor
@@ -41,6 +42,8 @@ class TerminationReason(IntEnum):
 # Looking a member up takes longer than the comparison it is used in, and the robot does so at every tick.
 _NONE, _START, _D_UPDATE, _HALF_INDEX, _INVALID, _GOAL, _OUTDATED = (int(reason) for reason in TerminationReason)
 
+LONGEST_PLAN = 10.0
+"""A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 REFRESH_S = 0.2
 """How old a plan may get that was made on another map than the present one [s]."""
 
@@ -181,7 +184,7 @@ class WaypointOption:
     num_rows: int
     rule: ReplanRule = field(default_factory=ReplanRule)
     num_waypoints: int = 10
-    goal_radius: float = 0.3
+    goal_radius: float = GOAL_RADIUS
     """A robot this close to its goal has reached it [m]."""
     sweep_radius: float = 0.1
     """Radius with which the way to the closest waypoint and the plan from there on are swept for `invalid` [m]."""
@@ -190,8 +193,6 @@ class WaypointOption:
     move are avoided before they are in the way. None: never."""
     predict: bool = True
     """Whether plans are made and swept on maps as they will be (`MapPredictor`), if their stamps are told."""
-    max_reach: float = 10.0
-    """A plan with a waypoint farther than this from the robot in x or y is refused [m]."""
 
     def __post_init__(self) -> None:
         shape = (self.num_rows, self.num_waypoints, 2)
@@ -221,7 +222,7 @@ class WaypointOption:
         self.counts[rows], self.refused[rows] = 0, 0
         self.waiting[rows] = self._adopted[rows] = False
         for row in rows.tolist():
-            self.visits[row] = None
+            self.visits[row] = self._swept[row] = self._planned_on[row] = None
             self._predictors[row].reset()
 
     def drop(self, rows: np.ndarray | slice | None = None) -> None:
@@ -247,7 +248,7 @@ class WaypointOption:
         """
         if plan.shape != self.plan[row].shape:
             raise ValueError(f"planner returned shape {plan.shape}, expected {self.plan[row].shape}")
-        if not (np.abs(plan - start) <= self.max_reach).all():
+        if not (np.abs(plan - start) <= LONGEST_PLAN).all():
             self.refused[row] += 1
             return False
         self._follow(row, plan, start, occupancy)
@@ -393,8 +394,8 @@ class WaypointOption:
                 if proposed.shape != plan[known].shape:
                     raise ValueError(f"planner returned shape {proposed.shape}, expected {plan[known].shape}")
                 plan[known] = proposed
-        # not "> max_reach", so that NaN is refused too
-        good = (np.abs(plan - position[:, None]) <= self.max_reach).all(axis=(1, 2))
+        # not "> LONGEST_PLAN", so that NaN is refused too
+        good = (np.abs(plan - position[:, None]) <= LONGEST_PLAN).all(axis=(1, 2))
         self.refused[rows[~good & ~later]] += 1
         hold = ~good & ~np.isfinite(self.plan[rows]).all(axis=(1, 2))
         plan[hold] = position[hold][:, None]

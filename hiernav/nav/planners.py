@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hiernav.nav import goselo
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.path import arc_lengths, polyline
@@ -163,21 +164,16 @@ class VerifiedPlanner:
     repair: ShortestPathPlanner
     radius: float = 0.1
     """Disc that must fit along the plan [m]."""
-    proposals: int = 0
-    goal_radius: float = 0.3
+    goal_radius: float = GOAL_RADIUS
     """Plans are judged up to where they come this close to the goal [m]."""
     least_gain: float = 0.5
     """Share of its length by which a plan must shorten the way to the goal."""
-    repairs: int = 0
-    loops: int = 0
-    detours: int = 0
-    refusals: int = 0
-    reasons: Counter[str] = field(default_factory=Counter)
-    """Refusals by why there is no path (`hiernav.nav.search.REFUSALS`)."""
+    tally: Counter[str] = field(default_factory=Counter, init=False)
+    """See `counts`."""
 
     def plan(self, query: PlanQuery) -> np.ndarray:
         plans = self.planner.plan(query)
-        self.proposals += len(plans)
+        self.tally["proposals"] += len(plans)
         clearance = np.array(
             [
                 swept_clearance(position[None], plan[None], occupancy)[0]
@@ -203,17 +199,19 @@ class VerifiedPlanner:
         refused = np.flatnonzero(~found & ~free[bad]).tolist()
         plans = plans.copy()
         plans[bad] = np.where((found | ~free[bad])[:, None, None], repaired, plans[bad])
-        self.repairs += int(found.sum())
-        self.loops += int((found & back[bad]).sum())
-        self.detours += int((found & away[bad]).sum())
-        self.refusals += len(refused)
-        self.reasons.update(self.repair.refusal(part, row) or "tight" for row in refused)
+        self.tally["repairs"] += int(found.sum())
+        self.tally["loops"] += int((found & back[bad]).sum())
+        self.tally["detours"] += int((found & away[bad]).sum())
+        self.tally["refusals"] += len(refused)
+        self.tally.update(f"refusals/{self.repair.refusal(part, row) or 'tight'}" for row in refused)
         return plans
 
     def counts(self) -> dict[str, int]:
-        """Proposals, repairs, loops and detours among them, refusals and why, `refusals/...`, since the start."""
-        totals = {name: getattr(self, name) for name in COUNTS}
-        return totals | {f"refusals/{reason}": count for reason, count in sorted(self.reasons.items())}
+        """Proposals, repairs, loops and detours among them, refusals and why there is no path, since the start.
+
+        The latter are named `refusals/...` (`hiernav.nav.search.REFUSALS`).
+        """
+        return {name: self.tally[name] for name in COUNTS} | dict(sorted(self.tally.items()))
 
     def _fits(self, repaired: np.ndarray, query: PlanQuery) -> np.ndarray:
         """Whether shortest paths (M, K, 2), NaN where there is none, leave the disc room: (M,) bool."""
@@ -281,7 +279,7 @@ def verified_planner(
     channels: tuple[str, ...],
     expert: ShortestPathPlanner,
     robot_radius: float,
-    goal_radius: float = 0.3,
+    goal_radius: float = GOAL_RADIUS,
 ) -> VerifiedPlanner:
     """A network's plans as robots drive them: checked for a disc of `robot_radius` [m], repaired by the expert.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import OccupancyMap
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 CELL = 0.1  # [m], planning grid of the paper
 _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
 STANDING = 0.1  # [m], by which a robot may miss the end of its path, strayed or stopped short
-GOAL_REACH = 0.3 - STANDING  # [m], from the goal to the end of a path, where 0.3 m count as reached
+GOAL_REACH = GOAL_RADIUS - STANDING  # [m], from the goal to the end of a path
 LEAD = 4.0 * CELL  # [m], beyond its radius, as far as a robot is led to where its way begins
 _DIP = 0.005  # [m], fall of the clearance along a lead that is put down to the pixels of the map
 _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line

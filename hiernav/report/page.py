@@ -109,6 +109,7 @@ def _strict(book: Book) -> str:
         "<p>1000 episodes in layouts that no network has seen, most of kinds that ours were trained in; every contact "
         "counts, leaving the field is a failure. SPL is success weighted by shortest over driven length. The dotted "
         "line is the target of 0.97. A* in the place of the learned planner is not in the paper.</p>",
+        f"<p>{escape(tables.redraws(book))}</p>",
         _gallery([(figures.reach(book, robot), f"{robot}: reach rate") for robot in reversed(ROBOTS)]),
         _command(book, "--only table3 astar"),
     ]
@@ -177,9 +178,10 @@ def _efficiency(book: Book) -> str:
 
 def _replanning(book: Book) -> str:
     return (
-        "<p>The rule against fixed periods, with the bundles that ship; the paper’s rule planned every 8.5 steps of "
-        "the doggo (10 Hz; the car runs at 25 Hz, the point at 50 Hz). With a fixed period nothing else ends a plan; a "
-        "robot that stands still gets a way out, and another plan behind it, under both.</p>"
+        "<p>The rule against fixed periods, with the bundles that ship; the paper’s rule planned every "
+        f"{paper.STEPS_BETWEEN_PLANS} steps of the doggo (10 Hz; the car runs at 25 Hz, the point at 50 Hz). With a "
+        "fixed period nothing else ends a plan; a robot that stands still gets a way out, and another plan behind it, "
+        "under both.</p>"
         + _gallery([(figures.replanning(book, world), world) for world in DEPARTURE_WORLDS])
         + _by_robot(lambda robot: tables.replanning(book, robot))
         + "<h3>Trained with fixed periods, as in the paper</h3>"

@@ -99,6 +99,23 @@ def strict(book: Book, robot: str) -> str:
     return table([_HEADS[name] for name in names], rows, "world, policies")
 
 
+def redraws(book: Book) -> str:
+    """How many layouts had to be drawn again, in a sentence."""
+    parts = []
+    for robot in ROBOTS:
+        counts = {
+            world: result.metrics["strict"].get("redraws", 0)
+            for world in WORLDS
+            for result in book.group("table3", "shipped", robot, world).done
+        }
+        again = [f"{count} in {world}" for world, count in counts.items() if count]
+        if counts:
+            parts.append(f"{robot} {', '.join(again) or 'none'}")
+    return (
+        f"Layouts that no way leads through for the robot are drawn again; for 1000 of each world: {'; '.join(parts)}."
+    )
+
+
 def table2(book: Book) -> str:
     """Table II and ours."""
     rows = []

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from hiernav.config import TrainConfig, load_config
+from hiernav.config import PRESETS, RewardConfig, TrainConfig, load_config
 from hiernav.film.film import film_name
 from hiernav.finetune import DEFAULTS
 from hiernav.planner import passes
@@ -91,9 +91,10 @@ OF_LEGS = ("no-tilt-cost", "go-on-after-fall", "no-clock", "no-time-cost")
 """Departures that are left out with the quadruped instead."""
 NEUTRAL = {"waypoint_frame": "body"}
 """Settings of the skill that came after the first results, and the values that say what was done before."""
+_BASELINE_REWARD = msgspec.structs.asdict(RewardConfig()) | PRESETS["reward"]["baseline"]
 BASELINE = [
     "skill.preset=baseline", "skill.reward_scale=1.0",
-    "reward.time=0", "reward.tilt=-3", "reward.leave_field=-60", "reward.fall=-60",
+    *(f"reward.{name}={_BASELINE_REWARD[name]}" for name in ("time", "tilt", "leave_field", "fall")),
 ]  # fmt: skip
 """Its rewards are as large as ours after scaling: every step costs the distance to the goal, and an early end 60. What
 a robot's file says of them is meant for ours."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hiernav.nav.goal import GoalRefused, place_goal
+from hiernav.nav.goal import GOAL_RADIUS, GoalRefused, place_goal
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import Clock
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 class DriverConfig:
     """When a robot waits, when it gives up, and when a run ends."""
 
-    goal_radius: float = 0.3
+    goal_radius: float = GOAL_RADIUS
     """The goal is reached within this distance of the estimated position [m]."""
     goal_tolerance: float = 0.3
     """A goal inside an obstacle may be moved this far, to where the robot fits or at least to a free point [m]."""

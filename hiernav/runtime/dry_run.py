@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from hiernav.nav.bundle import Bundle
+from hiernav.nav.observation import GUIDES
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.guard import Guard
-from hiernav.runtime.pilot import GUIDES
 from hiernav.runtime.policy import check_golden, load_policies, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime

@@ -8,12 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
+from hiernav.nav.observation import GUIDES
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
 from hiernav.runtime.estimate import Estimate
-
-GUIDES = ("waypoints", "world_waypoints", "goal", "clock")
-"""Observation terms that the agent adds to those of the robot's sensors."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -97,9 +96,9 @@ class PlannerMemory:
         return PlannerMemory(self._memory)
 
     @property
-    def settings(self) -> Mapping[str, Any]:
-        """What the planner is made of, besides its network."""
-        return json.loads(self._memory[self._settings])
+    def settings(self) -> bytes:
+        """What the planner is made of, besides its network, as JSON."""
+        return self._memory[self._settings]
 
     @property
     def model(self) -> bytes:

@@ -13,17 +13,17 @@ import signal
 import sys
 import time
 
+import msgspec
 import numpy as np
 import scipy.sparse.csgraph  # noqa: F401  by the first search, which the keeper is to have imported
 
-from hiernav.nav.goselo import CHANNELS
+from hiernav.nav.goselo import PIXELS
 from hiernav.nav.option import Planner, PlanQuery
-from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner, verified_planner
-from hiernav.nav.search import goal_reach_for
+from hiernav.nav.planners import VerifiedPlanner
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.mailbox import mapped
 from hiernav.runtime.planner_memory import PlannerMemory, Reply
-from hiernav.runtime.policy import OnnxPlannerNetwork
+from hiernav.runtime.policy import OnnxPlannerNetwork, PlannerSettings
 
 MAX_RESTARTS = 3
 RESTART, FORGIVE = b"r", b"f"
@@ -83,20 +83,10 @@ def _start(news: int, questions: int, memory: PlannerMemory) -> int:
 
 def make_planner(memory: PlannerMemory) -> Planner:
     """The planner that the settings describe, warmed up by one question."""
-    settings = memory.settings
-    expert = ShortestPathPlanner(
-        settings["planning_radius_m"],
-        settings["soft_margin_m"],
-        num_waypoints=memory.waypoints,
-        spacing=settings["spacing_m"],
-        goal_reach=goal_reach_for(settings["goal_radius"]),
-    )
-    if not memory.model:
-        return expert
+    settings = msgspec.json.decode(memory.settings, type=PlannerSettings)
     network = OnnxPlannerNetwork(memory.model)
-    channels = tuple(settings["channels"]) or CHANNELS
-    network(np.zeros((1, len(channels), 64, 64), np.uint8), np.ones(1, np.float32))
-    return verified_planner(network, channels, expert, settings["robot_radius"], settings["goal_radius"])
+    network(np.zeros((1, network.channels, PIXELS, PIXELS), np.uint8), np.ones(1, np.float32))
+    return settings.planner_of(network)
 
 
 def answer_questions(questions: int, memory: PlannerMemory, planner: Planner) -> None:

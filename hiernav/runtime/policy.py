@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 import onnxruntime as ort
 
 from hiernav.nav import goselo
-from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, TensorSpec
+from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, PlanSpec, TensorSpec
+from hiernav.nav.goal import GOAL_RADIUS
+from hiernav.nav.observation import WAYPOINT_GUIDES
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
 from hiernav.runtime.robot import Robot
@@ -146,7 +149,7 @@ def _require_waypoints(bundle: Bundle) -> None:
     """BundleError unless the skill observes as many waypoints as a plan has; a baseline observes none."""
     count = bundle.manifest.plan.waypoints
     for term in bundle.layout.terms:
-        if term.name in ("waypoints", "world_waypoints") and term.size != 2 * count:
+        if term.name in WAYPOINT_GUIDES and term.size != 2 * count:
             raise BundleError(f"plan.waypoints: {count} in a plan, the skill observes {term.size / 2:g}")
 
 
@@ -156,7 +159,35 @@ def require_fit(bundle: Bundle, robot: Robot) -> None:
     bundle.require_actions(robot.action_dim)
 
 
-def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float, goal_radius: float = 0.3) -> Planner:
+class PlannerSettings(msgspec.Struct, frozen=True):
+    """All that makes a planner of a network, also where that runs in another process."""
+
+    plan: PlanSpec
+    channels: tuple[str, ...]
+    """Of the network's images."""
+    robot_radius: float
+    """Disc with which plans are swept against the map [m]."""
+    goal_radius: float
+    """Distance at which the goal counts as reached [m]."""
+
+    def planner_of(self, network: OnnxPlannerNetwork) -> Planner:
+        """The network on GOSELO images, verified, and repaired by shortest paths."""
+        plan = self.plan
+        expert = ShortestPathPlanner(
+            plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
+        )
+        return verified_planner(network, self.channels, expert, self.robot_radius, self.goal_radius)
+
+
+def planner_settings(bundle: Bundle, robot_radius: float, goal_radius: float = GOAL_RADIUS) -> PlannerSettings:
+    """Those of the planner that a bundle describes."""
+    manifest = bundle.manifest
+    return PlannerSettings(manifest.plan, tuple(manifest.goselo.channels), robot_radius, goal_radius)
+
+
+def make_planner(
+    bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: float, goal_radius: float = GOAL_RADIUS
+) -> Planner:
     """The planner a bundle describes: the network on GOSELO images, verified, and repaired by shortest paths.
 
     Args:
@@ -165,17 +196,13 @@ def make_planner(bundle: Bundle, network: OnnxPlannerNetwork, robot_radius: floa
         robot_radius: disc with which plans are swept against the map [m].
         goal_radius: distance at which the goal counts as reached [m].
     """
-    plan = bundle.manifest.plan
-    expert = ShortestPathPlanner(
-        plan.planning_radius_m, plan.soft_margin_m, num_waypoints=plan.waypoints, spacing=plan.spacing_m
-    )
-    return verified_planner(network, bundle.manifest.goselo.channels, expert, robot_radius, goal_radius)
+    return planner_settings(bundle, robot_radius, goal_radius).planner_of(network)
 
 
 def make_agent(
     bundle: Bundle,
     robot_radius: float,
-    goal_radius: float = 0.3,
+    goal_radius: float = GOAL_RADIUS,
     planner: DeferredPlanner | None = None,
     predict: bool = True,
 ) -> HierarchicalAgent:

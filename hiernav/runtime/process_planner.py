@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from hiernav.nav.bundle import Bundle
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import PlanQuery
 from hiernav.nav.search import grid_cells
@@ -18,6 +19,7 @@ from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import mapped, shared_memory
 from hiernav.runtime.pilot import Answer
 from hiernav.runtime.planner_memory import PlannerMemory, Question, Status
+from hiernav.runtime.policy import planner_settings
 from hiernav.runtime.timing import Histogram
 
 LOADING = 5.0
@@ -49,7 +51,7 @@ class ProcessPlanner:
         robot_radius: float,
         map_pixels: int,
         hang_after: float = 0.5,
-        goal_radius: float = 0.3,
+        goal_radius: float = GOAL_RADIUS,
         seconds_per_cell: float = SECONDS_PER_CELL,
     ) -> None:
         """
@@ -61,18 +63,8 @@ class ProcessPlanner:
             goal_radius: distance at which the goal counts as reached [m].
             seconds_per_cell: further time for every planning cell of the largest map asked with [s].
         """
-        manifest = bundle.manifest
-        settings = json.dumps(
-            {
-                "planning_radius_m": manifest.plan.planning_radius_m,
-                "soft_margin_m": manifest.plan.soft_margin_m,
-                "spacing_m": manifest.plan.spacing_m,
-                "channels": manifest.goselo.channels,
-                "robot_radius": robot_radius,
-                "goal_radius": goal_radius,
-            }
-        ).encode()
-        waypoints = manifest.plan.waypoints
+        settings = msgspec.json.encode(planner_settings(bundle, robot_radius, goal_radius))
+        waypoints = bundle.manifest.plan.waypoints
         self.stamp = 0.0
         self.hang_after, self.seconds_per_cell = hang_after, seconds_per_cell
         self.patience = hang_after

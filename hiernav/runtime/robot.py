@@ -72,7 +72,12 @@ class Truth:
 
 
 class Robot(Protocol):
-    """A robot, simulated or real. Adapters brake by themselves when commands stop coming (`CommandWatchdog`)."""
+    """A robot, simulated or real.
+
+    An adapter's process brakes it when commands stop coming (`CommandWatchdog`). While a method of this class blocks,
+    or if that process is killed or crashes, nothing here can brake: the motor controller must stop by itself about
+    100 ms after the last command, or the last brake, that it got (200 ms for a robot that is commanded at 10 Hz).
+    """
 
     @property
     def control_period(self) -> float:
@@ -83,15 +88,24 @@ class Robot(Protocol):
     def action_dim(self) -> int: ...
 
     def read(self) -> SensorFrame:
-        """The newest sensor values, without waiting for newer ones."""
+        """The newest sensor values, without waiting for newer ones.
+
+        Always a `SensorFrame`, also where no sensor said anything: each field that is missing is None then. Anything
+        else is an error that says so, and ends the adapter.
+        """
         ...
 
     def send(self, action: np.ndarray) -> np.ndarray:
-        """Command (A,) in [-1, 1]; returns what was really sent."""
+        """Command (A,) in [-1, 1], what a body makes of which is in `deploy/README.md`; returns what was really sent.
+
+        What is returned is used only where the robot lives in the loop's own process, that is in simulation without
+        real time (`--fast`). Behind an adapter's process it is ignored, and what a recording calls `sent` is what the
+        loop gave, clipped to [-1, 1].
+        """
         ...
 
     def brake(self) -> None:
-        """Command the safe stop. May be called at any time and any number of times."""
+        """Command the safe stop. May be called at any time and any number of times, also before the first command."""
         ...
 
     def close(self) -> None:

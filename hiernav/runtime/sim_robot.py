@@ -16,9 +16,10 @@ from hiernav.runtime.clock import Clock, MonotonicClock
 from hiernav.runtime.noise import EXACT, SensorNoise
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame, Truth
 from hiernav.sim.batch import BatchSim
+from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.scene import SceneSpec, scene_for
-from hiernav.sim.worlds import Layout, parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 __all__ = ["EXACT", "SensorNoise", "SimRobot", "make"]
 

@@ -12,9 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 
+from hiernav.sim.layout import Layout
 from hiernav.sim.robots import BASE_SENSORS, JointReader, RobotSpec
 from hiernav.sim.scene import CONTACT_SENSORS, ObstaclePool, SceneSpec, build_model
-from hiernav.sim.worlds import Layout
 
 STATE_LIMIT = 1e10
 """Positions and velocities beyond this count as not finite, as in MuJoCo's own check."""

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from hiernav.config import ConfigError, TrainConfig
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.option import Planner, ReplanRule, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
-from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, parse_world
+from hiernav.sim.layout import Layout, WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.task import LayoutSource, NavigationTask
 from hiernav.sim.worlds import sample_layout

@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 
 from hiernav.config import TrainConfig, load_config
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.option import Planner, TerminationReason
 from hiernav.sim.factory import make_task
-from hiernav.sim.layout import GOAL_RADIUS, Layout, parse_world
+from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.task import NavigationTask
 from hiernav.sim.worlds import sample_layout
 

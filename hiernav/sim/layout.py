@@ -19,7 +19,6 @@ PILLAR_HALF_HEIGHT = 0.5
 GREMLIN_HALF_SIZE = 0.1
 GREMLIN_ORBIT = 0.3
 WALL_THICKNESS = 0.1
-GOAL_RADIUS = 0.3
 GREMLIN_DISC_RADIUS = GREMLIN_HALF_SIZE * math.sqrt(2.0)  # a gremlin's box in any orientation
 
 LIDAR_SPACING = 0.1  # [m] between the points that stand for a wall

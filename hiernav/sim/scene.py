@@ -13,19 +13,11 @@ from math import ceil
 import mujoco
 import numpy as np
 
+from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.sim.layout import cached_map
+from hiernav.sim.layout import GREMLIN_HALF_SIZE, PILLAR_HALF_HEIGHT, WALL_THICKNESS, Layout, WorldSpec, cached_map
 from hiernav.sim.robots import RobotSpec
-from hiernav.sim.worlds import (
-    FOUR_ROOM_OPENING,
-    GREMLIN_HALF_SIZE,
-    PILLAR_HALF_HEIGHT,
-    PILLAR_RADIUS,
-    TWO_ROOM_OPENING,
-    WALL_THICKNESS,
-    Layout,
-    WorldSpec,
-)
+from hiernav.sim.worlds import FOUR_ROOM_OPENING, TWO_ROOM_OPENING
 
 FLOOR_HALF_SIZE = 5.0
 WALL_HALF_HEIGHT = 0.5

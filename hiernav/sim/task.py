@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hiernav.config import RewardConfig
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import OptionStep, WaypointOption, observe
 from hiernav.nav.recovery import Recovery
 from hiernav.sim.batch import BatchSim
-from hiernav.sim.layout import GOAL_RADIUS, Layout, WorldSpec, inside
+from hiernav.sim.layout import Layout, WorldSpec, inside
 from hiernav.sim.reward import reward_terms, weighted_sum
 from hiernav.sim.robots import RobotSpec
 from hiernav.sim.scene import scene_for

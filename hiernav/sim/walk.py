@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import VisitMap
 from hiernav.nav.option import Planner, PlanQuery
-from hiernav.sim.layout import GOAL_RADIUS, Layout
+from hiernav.sim.layout import Layout
 
 
 @dataclass

@@ -9,35 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.search import is_solvable
 from hiernav.sim.layout import (
-    GOAL_RADIUS,
     GREMLIN_DISC_RADIUS,
-    GREMLIN_HALF_SIZE,
     GREMLIN_ORBIT,
-    PILLAR_HALF_HEIGHT,
     WALL_THICKNESS,
     Layout,
     WorldSpec,
     cached_map,
-    parse_world,
 )
-
-__all__ = [
-    "GOAL_RADIUS",
-    "GREMLIN_HALF_SIZE",
-    "GREMLIN_ORBIT",
-    "PILLAR_HALF_HEIGHT",
-    "PILLAR_RADIUS",
-    "WALL_THICKNESS",
-    "Layout",
-    "WorldError",
-    "WorldSpec",
-    "parse_world",
-    "sample_layout",
-]
 
 START_KEEP_OUT = 0.4
 GOAL_KEEP_OUT = 0.4

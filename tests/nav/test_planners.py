@@ -175,7 +175,7 @@ def verified(radius: float = 0.1) -> tuple[VerifiedPlanner, WatchedPlanner]:
 
 
 def counts(planner: VerifiedPlanner) -> tuple[int, int, int]:
-    return planner.proposals, planner.repairs, planner.refusals
+    return planner.tally["proposals"], planner.tally["repairs"], planner.tally["refusals"]
 
 
 def test_a_plan_through_a_pillar_is_replaced_by_the_way_around_it() -> None:
@@ -337,7 +337,7 @@ def test_a_plan_that_leads_where_the_robot_has_been_is_replaced_by_the_shortest_
     plans = planner.plan(query)
     assert_array_equal(plans[0], aside[0])
     assert_array_equal(plans[1], planner.repair.plan(query)[1])
-    assert (*counts(planner), planner.loops) == (2, 1, 0, 1)
+    assert (*counts(planner), planner.tally["loops"]) == (2, 1, 0, 1)
 
 
 def test_a_plan_that_does_not_bring_the_robot_nearer_to_the_goal_is_replaced() -> None:
@@ -348,7 +348,7 @@ def test_a_plan_that_does_not_bring_the_robot_nearer_to_the_goal_is_replaced() -
     plans = planner.plan(query)
     assert_array_equal(plans[0], planner.repair.plan(query)[0])
     assert_array_equal(plans[1], proposed[1])
-    assert (*counts(planner), planner.loops, planner.detours) == (2, 1, 0, 0, 1)
+    assert (*counts(planner), planner.tally["loops"], planner.tally["detours"]) == (2, 1, 0, 0, 1)
 
 
 def test_nearer_means_on_the_way_around_obstacles() -> None:
@@ -361,7 +361,7 @@ def test_nearer_means_on_the_way_around_obstacles() -> None:
     assert shortest[0, -1, 1] > 0.5
     proposer.plan = lambda query: shortest.copy()
     assert_array_equal(planner.plan(query), shortest)
-    assert planner.detours == 0
+    assert planner.tally["detours"] == 0
 
 
 def test_a_free_plan_that_leads_back_stands_where_there_is_no_path() -> None:
@@ -373,4 +373,4 @@ def test_a_free_plan_that_leads_back_stands_where_there_is_no_path() -> None:
     proposer.plan = lambda query: back
     query.visits[0].add([(-0.5, -0.4)])
     assert_array_equal(planner.plan(query), back)
-    assert (*counts(planner), planner.loops) == (1, 0, 0, 0)
+    assert (*counts(planner), planner.tally["loops"]) == (1, 0, 0, 0)

@@ -14,7 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
 from hiernav.nav.path import arc_lengths
 from hiernav.nav.search import CELL, LEAD, PathField, is_solvable, random_shortcuts, resample
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.layout import parse_world
+from hiernav.sim.worlds import sample_layout
 
 RADIUS = 0.1
 PIXELATION = 0.03

@@ -13,8 +13,8 @@ from hiernav.nav.occupancy import OccupancyMap, nearest_pixel
 from hiernav.planner import dataset
 from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples, map_tasks
 from hiernav.run import WorkersLost
-from hiernav.sim.layout import parse_world
-from hiernav.sim.worlds import Layout, WorldError, sample_layout
+from hiernav.sim.layout import Layout, parse_world
+from hiernav.sim.worlds import WorldError, sample_layout
 
 RADIUS = 0.1
 SETTINGS = LabelSettings(worlds=("pillar(1.5,1.5,5)",), radius=RADIUS, soft_margin=0.1, samples_per_world=8)

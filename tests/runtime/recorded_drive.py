@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hiernav.nav.bundle import load_bundle
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.runtime.about import About
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.delayed_planner import DelayedPlanner
@@ -22,7 +23,7 @@ from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import load_policies, make_agent, make_planner
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SensorNoise, SimRobot
-from hiernav.sim.layout import GOAL_RADIUS, Layout, parse_world
+from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
 

@@ -26,8 +26,9 @@ from hiernav.runtime.supervisor import InvalidTransition, Mode
 from hiernav.runtime.terms import TermHold
 from hiernav.runtime.trip import RunResult
 from hiernav.runtime.watchdogs import StopWatch
+from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 
 def test_a_goal_in_the_open_is_reached_and_the_robot_stands_there():

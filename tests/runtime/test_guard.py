@@ -11,8 +11,9 @@ from shipped import ROOT
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.settings import load_settings
 from hiernav.runtime.sim_robot import EXACT, SimRobot
+from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 actions = st.lists(anything, min_size=3, max_size=3).map(np.array)

@@ -51,7 +51,7 @@ MUTANTS = (
            f"{F}/test_09_planner_hangs.py::test_the_old_plan_is_followed_then_slowly_and_then_the_robot_holds"),
     Mutant("no way", WATCH, "waited > self.give_up_after", "False", f"{F}/test_24_goal_unreachable.py"),
     Mutant("saturation", WATCH, "and self._sum >= self._limit", "and False", f"{F}/test_13_saturated_action.py"),
-    Mutant("stop", WATCH, "if estimate is None or not math", "if False and not math", f"{T}/test_driver.py"),
+    Mutant("stop", WATCH, "math.hypot(*estimate.velocity.tolist()) < self.speed", "True", f"{T}/test_driver.py"),
     Mutant("adapter", f"{R}/robot.py", "if now - self._fed_at <= self.timeout:", "if True:",
            f"{F}/test_21_control_process_gone.py"),
     Mutant("old command", f"{R}/robot_process.py", "fresh = now - given <= self.watchdog.timeout", "fresh = True",

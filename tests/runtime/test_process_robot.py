@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,6 +24,7 @@ from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
 from hiernav.runtime.robot_process import LAST_BRAKES, STATUS, Adapter, make_robot
+from hiernav.runtime.settings import load_settings
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command, encode_frame
 
 EXAMPLE = f"{ROOT / 'deploy' / 'example_robot.py'}:make"
@@ -307,15 +308,51 @@ def test_a_name_that_leads_to_no_robot_is_refused(name, why):
         make_robot(name, {})
 
 
-def test_the_example_robot_drives_where_it_is_told():
-    robot = make_robot(EXAMPLE, {})
+class ExampleDrive:
+    """The example robot on a clock of its own."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.robot = make_robot(EXAMPLE, {})
+        self.now = self.robot._board._at
+        monkeypatch.setattr(sys.modules["example_robot"], "time", SimpleNamespace(monotonic=lambda: self.now))
+
+    def speed_after(self, seconds: float, action: Sequence[float] | None = None) -> float:
+        """True forward speed once that time has passed, under `action` in each period if there is one [m/s]."""
+        for _ in range(round(seconds / self.robot.control_period)):
+            if action is not None:
+                self.robot.send(np.array(action))
+            self.now += self.robot.control_period
+        self.robot.read()
+        return self.robot._board._speed
+
+
+def test_the_example_robot_drives_where_it_is_told(monkeypatch):
+    drive = ExampleDrive(monkeypatch)
+    robot = drive.robot
     frame = robot.read()
     assert frame.position_fix is not None and np.linalg.norm(frame.position_fix) < 0.2
-    assert robot.send(np.array([1.5, 0.0])).tolist() == [1.0, 0.0]
-    board = robot._board
-    board._at -= 1.0  # a second passes
+    assert robot.send(np.array([1.5, -1.5])).tolist() == [0.05, -1.0]
+    assert drive.speed_after(1.0, (1.0, 0.0)) > 1.0
     assert robot.read().velocimeter[0] > 1.0
     robot.brake()
-    board._at -= 3.0
-    assert abs(robot.read().velocimeter[0]) < 0.15
+    assert abs(drive.speed_after(3.0)) < 0.01
     robot.close()
+
+
+def test_the_example_robot_saturates_as_the_body_does_so_that_its_guard_slows_it_in_proportion(monkeypatch):
+    saturation = load_settings([ROOT / "deploy" / "point.yaml"]).guard.saturation
+    full, slightly_slowed, half = (
+        ExampleDrive(monkeypatch).speed_after(4.0, (scale * saturation, 0.0)) for scale in (20.0, 0.99, 0.5)
+    )
+    assert full == pytest.approx(1.5, rel=0.01)
+    assert slightly_slowed == pytest.approx(0.99 * full) and half == pytest.approx(0.5 * full)
+
+
+def test_the_board_of_the_example_stops_by_itself_when_nobody_commands_it(monkeypatch):
+    drive = ExampleDrive(monkeypatch)
+    fast = drive.speed_after(1.0, (1.0, 0.5))
+    slightly_later = drive.speed_after(0.06)
+    assert slightly_later >= fast, "a command is late, not lost"
+    assert drive.speed_after(0.1) < slightly_later
+    assert drive.speed_after(2.0) < 0.05 * fast and abs(drive.robot._board._turn) < 0.01
+    assert drive.speed_after(0.5, (1.0, 0.0)) > 0.5, "it drives on with the next command"

@@ -145,7 +145,7 @@ def test_a_drive_after_a_tick_that_failed_is_replayed_too(tmp_path, bundle):
         if tick == 3 or record.mode is Mode.FAULT:
             operator.driver.set_goal(operator.goal)
 
-    log = served(tmp_path / "failed.mcap", Operator(80, command), fails_at=20)
+    log = served(tmp_path / "failed.mcap", Operator(200, command), fails_at=20)
     ticks = list(log.ticks())
     assert [tick.index for tick in ticks] == list(range(len(ticks)))
     (failed,) = (tick for tick in ticks if tick.mode is Mode.FAULT)

@@ -8,8 +8,9 @@ import pytest
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog
 from hiernav.runtime.sim_robot import EXACT, SensorNoise, SimRobot
+from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import ROBOTS, get_robot
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 LAYOUT = sample_layout(parse_world("pillar(2,2,4)"), seed=1)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.sim.worlds import Layout, WorldSpec
+from hiernav.sim.layout import Layout, WorldSpec
 
 
 def layout_of(

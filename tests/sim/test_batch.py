@@ -9,9 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenery import layout_of
 
 from hiernav.sim.batch import BatchSim
+from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import ROBOTS, get_robot
 from hiernav.sim.scene import SceneSpec, boxes_of, scene_for
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 every_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS.keys())
 OBSTACLES = ("pillar", "gremlin", "brick", "map")

@@ -99,4 +99,4 @@ def test_a_verified_planner_leads_around_where_the_obstacle_is_now() -> None:
         still(task)
         now = CROSSING.occupancy(float(task.sim.time[0]))
         assert now.is_free(task.option.plan[0], task.robot.radius - 0.03).all()
-    assert planner.repairs > 0
+    assert planner.tally["repairs"] > 0

@@ -10,10 +10,10 @@ import pytest
 
 from hiernav.nav.search import PathField
 from hiernav.sim.batch import BatchSim
-from hiernav.sim.layout import Layout
+from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.scene import scene_for
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 POINT = get_robot("point")
 PIXELATION = 0.03

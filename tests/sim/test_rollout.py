@@ -10,8 +10,9 @@ from scenery import layout_of
 from small_tasks import WORLD
 
 from hiernav.config import TrainConfig
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.sim.factory import make_task
-from hiernav.sim.layout import GOAL_RADIUS, Layout
+from hiernav.sim.layout import Layout
 from hiernav.sim.robots import get_robot
 from hiernav.sim.rollout import Episode, run_episodes, shortest_length
 from hiernav.sim.worlds import sample_layout

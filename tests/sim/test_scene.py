@@ -10,9 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenery import layout_of
 
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
+from hiernav.sim.layout import GREMLIN_HALF_SIZE, Layout, parse_world
 from hiernav.sim.robots import ROBOTS, get_robot
 from hiernav.sim.scene import BRICK_LENGTH, ObstaclePool, SceneSpec, boxes_of, brick_poses, build_model, scene_for
-from hiernav.sim.worlds import GREMLIN_HALF_SIZE, Layout, parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 FIELD = (2.0, 2.0)
 

@@ -12,19 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.lidar import PILLAR_RADIUS
 from hiernav.nav.search import is_solvable
-from hiernav.sim.worlds import (
-    GOAL_RADIUS,
-    GREMLIN_HALF_SIZE,
-    GREMLIN_ORBIT,
-    WALL_THICKNESS,
-    Layout,
-    WorldError,
-    WorldSpec,
-    parse_world,
-    sample_layout,
-)
+from hiernav.sim.layout import GREMLIN_HALF_SIZE, GREMLIN_ORBIT, WALL_THICKNESS, Layout, WorldSpec, parse_world
+from hiernav.sim.worlds import WorldError, sample_layout
 
 PAPER_WORLDS = ["pillar(2,2,10)", "pillar(3,3,25)", "pillar(4,4,40)", "gremlin", "two-room", "four-room"]
 SMALL_WORLDS = ["pillar(2,2,10)", "gremlin", "two-room", "four-room"]

@@ -138,12 +138,12 @@ def test_plans_are_counted_alike_whether_or_not_a_run_was_interrupted_and_withou
     ours, theirs = (metrics_of(tmp_path / name) for name in ("straight", "interrupted"))
     assert ours == theirs and len(ours) == 4
     counted = sum(line["plans/proposals"] for line in ours if line["stage"] == "skill")
-    assert 0 < counted < straight.planner.proposals
+    assert 0 < counted < straight.planner.tally["proposals"]
 
 
 def test_plans_that_workers_make_are_not_counted_here(tmp_path):
     trainer = trainer_in(tmp_path / "run", "skill.collector=multi", planner=verified())
-    trainer.planner.proposals += 1  # as an evaluation does
+    trainer.planner.tally["proposals"] += 1  # as an evaluation does
     assert trainer._new_plans() == {}
     trainer.batches.close()
 

@@ -16,8 +16,9 @@ from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.settings import load_settings
 from hiernav.runtime.sim_robot import EXACT, SimRobot
 from hiernav.runtime.supervisor import Mode
+from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
-from hiernav.sim.worlds import parse_world, sample_layout
+from hiernav.sim.worlds import sample_layout
 
 PERIOD, GOAL = 0.02, np.array([1.5, 0.0])
 OPEN = map_with()
