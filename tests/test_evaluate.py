@@ -247,6 +247,23 @@ def test_a_folder_that_is_neither_run_nor_bundle_is_refused(tmp_path):
         open_policies(tmp_path / "absent")
 
 
+def test_a_bundle_is_driven_by_the_rule_and_the_plans_that_its_manifest_says(tmp_path):
+    shutil.copytree(POINT_BUNDLE, tmp_path / "bundle")
+    manifest = json.loads((tmp_path / "bundle" / MANIFEST).read_text())
+    manifest["replan"] |= {"d_update_m": 0.41, "half_fraction": 0.7, "invalid": False, "period": 16}
+    manifest["plan"] |= {"planning_radius_m": 0.13, "soft_margin_m": 0.07, "spacing_m": 0.1}
+    (tmp_path / "bundle" / MANIFEST).write_text(json.dumps(manifest))
+    policies = open_policies(tmp_path / "bundle")
+    option = policies.config.option
+    assert (option.d_update_m, option.half_fraction, option.invalid, option.period) == (0.41, 0.7, False, 16)
+    expert = make_planner(policies, "astar")
+    assert isinstance(expert, ShortestPathPlanner) and (expert.radius, expert.soft_margin) == (0.13, 0.07)
+    verified = make_planner(policies, "cnn")
+    assert isinstance(verified, VerifiedPlanner) and isinstance(verified.planner, GoseloPlanner)
+    assert (verified.radius, verified.repair.radius) == (0.1, 0.13), "checked for the robot, repaired as it was taught"
+    assert (verified.planner.radius, verified.planner.margin) == (0.13, 0.07)
+
+
 @pytest.mark.train
 def test_a_run_without_a_trained_skill_is_refused_with_a_hint(tmp_path):
     from hiernav.run import Run

@@ -145,6 +145,22 @@ def test_the_manifest_holds_what_the_networks_assume(able_bundle, able_run):
     assert manifest.provenance["skill_steps"] == 768 and manifest.provenance["seed"] == 3
 
 
+def test_the_manifest_holds_the_rule_and_the_plans_as_they_were_configured(able_run, tmp_path, monkeypatch):
+    run, told = Run.open(able_run), []
+    network, actor = load_network(run.config, run.load("planner")), load_actor(run.config, run.load("skill"))
+    for name in ("_export", "load_bundle", "check_golden"):
+        monkeypatch.setattr(export, name, lambda *_: None)
+    monkeypatch.setattr(export, "write_manifest", lambda _, manifest: told.append(manifest))
+    rule = ("d_update_m=0.41", "half_fraction=0.7", "invalid=false", "period=16")
+    plans = ("planner.planning_radius_m=0.13", "planner.soft_margin_m=0.07")
+    config = tiny_run.config(able_run, *(f"option.{text}" for text in rule), *plans)
+    export.write_bundle(tmp_path, config, network, actor, {})
+    (manifest,) = told
+    replan, plan = manifest.replan, manifest.plan
+    assert (replan.d_update_m, replan.half_fraction, replan.invalid, replan.period) == (0.41, 0.7, False, 16)
+    assert (plan.waypoints, plan.spacing_m, plan.planning_radius_m, plan.soft_margin_m) == (10, 0.1, 0.13, 0.07)
+
+
 def test_the_papers_planner_and_another_robot_are_exported_too(doggo_bundle):
     loaded, robot = load_bundle(doggo_bundle), get_robot("doggo")
     loaded.require_robot("doggo", file_sha256(robot.xml_path))

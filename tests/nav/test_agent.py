@@ -53,6 +53,33 @@ def test_an_agent_that_is_reset_plans_again() -> None:
     assert reasons == [START, NONE, START, NONE]
 
 
+def test_a_robot_that_stands_still_sees_less_of_what_holds_it_until_it_is_reset() -> None:
+    layout = get_robot("point").observation_layout()
+    sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms} | {"lidar": np.full((1, 10), 0.5)}
+    agent = HierarchicalAgent(WaypointOption(StraightPlanner(), 1), lambda o: o[:, :2], layout, PERIOD)
+
+    def seen() -> float:
+        step = agent.act(np.zeros((1, 3)), sensors, np.array([FAR]), [FREE])
+        return float(step.observation[0, layout.slices["lidar"]].max())
+
+    moments = [seen() for _ in range(round(2.0 / PERIOD))]
+    assert moments[0] == 0.5 and moments[-1] == pytest.approx(0.35)
+    agent.reset()
+    assert seen() == 0.5
+
+
+def test_a_plan_that_is_made_elsewhere_is_waited_for_and_ends_but_once() -> None:
+    class Elsewhere:
+        def plan(self, query: object) -> None:
+            return None
+
+    layout = get_robot("point").observation_layout()
+    sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms}
+    agent = HierarchicalAgent(WaypointOption(Elsewhere(), 1), lambda o: o[:, :2], layout, PERIOD)
+    steps = [agent.act(np.zeros((1, 3)), sensors, np.array([FAR]), [FREE]) for _ in range(3)]
+    assert [int(step.reason[0]) for step in steps] == [START, NONE, NONE]
+
+
 def test_the_gait_clock_starts_with_each_episode_and_runs_at_three_hertz() -> None:
     layout = get_robot("doggo").observation_layout(clock=True)
     sensors = {term.name: np.zeros((2, term.size)) for term in layout.terms}

@@ -198,6 +198,17 @@ def test_crops_preserve_area(seed: int, length: float, angle: float) -> None:
         assert image[name].mean() == pytest.approx(occupancy.occupied_at(points).mean(), abs=0.01), name
 
 
+def test_a_pixel_half_beyond_the_edge_of_a_map_of_odd_sides_is_half_of_what_lies_outside() -> None:
+    free = np.zeros((17, 21), np.uint8)
+    for outside in (0, 255):
+        coarse = goselo._halve(free, outside)[1]
+        assert coarse.shape == (9, 11)
+        assert not coarse[:-1, :-1].any()
+        assert_allclose(coarse[:-1, -1], 0.5 * outside, atol=1)
+        assert_allclose(coarse[-1, :-1], 0.5 * outside, atol=1)
+        assert_allclose(float(coarse[-1, -1]), 0.75 * outside, atol=1)
+
+
 def test_thin_pillars_do_not_vanish_in_the_widest_crop() -> None:
     """Pillars of two map pixels in a crop of 32 m: half a pixel of the image each, wherever they stand."""
     rng = np.random.default_rng(0)

@@ -441,6 +441,36 @@ def test_an_obstacle_that_comes_while_the_robot_stands_ends_the_plan_at_once() -
     assert drive.at((0.0, 0.0)) == [INVALID]
 
 
+def test_a_plan_for_which_the_last_episode_waited_does_not_hide_the_start_of_the_next() -> None:
+    class Elsewhere:
+        def plan(self, query: object) -> None:
+            return None
+
+    option, here, goal = WaypointOption(Elsewhere(), 1), np.zeros((1, 2)), np.array([FAR])
+    for _ in range(2):
+        steps = [option.step(here, goal, [FREE]) for _ in range(3)]
+        assert [TerminationReason(step.reason[0]) for step in steps] == [START, NONE, NONE]
+        option.reset()
+        assert not option.waiting[0]
+
+
+def test_reach_is_counted_from_the_robot_wherever_on_its_map_it_is() -> None:
+    drive = Drive(goal=(42.5, 0.0))
+    assert drive.at((40.0, 0.0)) == [START]
+    assert drive.option.started[0] and drive.option.refused == [0]
+    plan, start = drive.option.plan[0] + [0.0, 0.1], np.array([40.0, 0.1])
+    assert drive.option.adopt(0, plan, start, FREE)
+    assert not drive.option.adopt(0, plan - [40.0, 0.0], start, FREE), "near the origin and far from the robot"
+
+
+def test_the_place_where_a_robot_waits_for_its_first_plan_is_no_plan_that_is_replaced() -> None:
+    drive = Drive()
+    drive.planner.silent = True
+    drive.at((0.0, 0.0))
+    drive.at((0.0, 0.0))
+    assert len(drive.planner.queries) == 2 and np.isnan(drive.planner.queries[-1].previous).all()
+
+
 @pytest.mark.parametrize("far", [10.5, 1e9, np.inf, -1e300])
 def test_a_plan_that_leads_out_of_reach_is_refused(far: float) -> None:
     drive = Drive()

@@ -300,6 +300,17 @@ def test_of_hypotheses_that_all_collide_the_one_with_most_room_is_taken() -> Non
     assert plan[-1, 1] < -0.5
 
 
+@pytest.mark.parametrize(("ahead", "chosen"), [(0.0, 1), (1.0, 1), (4.0, 0)])
+def test_of_free_hypotheses_one_with_room_is_worth_some_score(ahead: float, chosen: int) -> None:
+    narrow = map_with_pillars([(0.5, 0.37)])
+    plans = np.stack([straight((0.0, 0.0), 0.0), straight((0.0, 0.0), -0.8)])
+    near, far = swept_clearance(np.zeros((2, 2)), plans, narrow)
+    assert 0.1 < near < 0.2 and far > 0.3
+    query = query_of([(0.0, 0.0)], [(2.0, 0.0)], narrow)
+    planner = GoseloPlanner(Fan(scores=(0.0, 0.0, 0.0)))
+    assert_array_equal(planner.select(plans[None], np.array([[ahead, 0.0]]), query)[0], plans[chosen])
+
+
 @pytest.mark.parametrize(("side", "turn"), [("left", 0.9), ("right", -0.9)])
 def test_between_equals_the_side_of_the_plan_before_is_kept(side: str, turn: float) -> None:
     previous = straight((-0.1, 0.0), turn)[None]
@@ -338,6 +349,16 @@ def test_a_plan_that_leads_where_the_robot_has_been_is_replaced_by_the_shortest_
     assert_array_equal(plans[0], aside[0])
     assert_array_equal(plans[1], planner.repair.plan(query)[1])
     assert (*counts(planner), planner.tally["loops"]) == (2, 1, 0, 1)
+
+
+def test_a_plan_that_begins_where_the_robot_has_just_been_is_no_loop() -> None:
+    planner, proposer = verified()
+    query = query_of([(0.0, 0.0)], [(1.5, 0.0)], FREE)
+    aside = straight((0.0, 0.0), np.pi / 5)[None]
+    proposer.plan = lambda query: aside.copy()
+    query.visits[0].add(np.linspace([-0.5, 0.0], [0.1, 0.0], 13))
+    assert_array_equal(planner.plan(query), aside)
+    assert counts(planner) == (1, 0, 0)
 
 
 def test_a_plan_that_does_not_bring_the_robot_nearer_to_the_goal_is_replaced() -> None:

@@ -85,6 +85,12 @@ def test_a_fixed_period_is_not_cut_short_because_the_map_has_changed() -> None:
     assert reason_of(ReplanRule(period=8), age=8, outdated=True) == HALF_INDEX
 
 
+def test_a_fixed_period_is_cut_short_by_what_is_in_the_way_and_by_the_goal() -> None:
+    assert reason_of(ReplanRule(period=8), age=7, blocked=True) == INVALID
+    assert reason_of(ReplanRule(period=8), age=7, at_goal=True) == GOAL
+    assert reason_of(ReplanRule(period=8, invalid=False), age=7, blocked=True) == NONE
+
+
 @given(st.floats(0.0, 5.0), st.integers(0, 10), st.integers(0, 40))
 def test_with_a_period_neither_distance_nor_index_matters(distance: float, index: int, age: int) -> None:
     expected = HALF_INDEX if age >= 16 else NONE

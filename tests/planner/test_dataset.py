@@ -10,6 +10,7 @@ import pytest
 
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, nearest_pixel
+from hiernav.nav.search import PathField
 from hiernav.planner import dataset
 from hiernav.planner.dataset import LabelSettings, Samples, label_world, make_samples, map_tasks
 from hiernav.run import WorkersLost
@@ -76,6 +77,33 @@ def test_samples_depend_on_the_seed_and_not_on_the_number_of_processes():
 def test_a_process_that_is_killed_while_it_makes_samples_is_told_in_one_line():
     with pytest.raises(WorkersLost, match=r"^one of 2 processes that make samples died, [^\n]*with fewer threads$"):
         list(map_tasks(os._exit, [(9,), (9,)], 2))
+
+
+def test_worlds_are_drawn_from_the_whole_mix_and_each_has_a_seed_of_its_own(monkeypatch):
+    drawn = []
+
+    def noting(settings, spec, seed, count):
+        drawn.append((spec.kind, seed))
+        return Samples.empty(settings, count)
+
+    monkeypatch.setattr(dataset, "label_world", noting)
+    make_samples(replace(SETTINGS, worlds=("3*pillar(1.5,1.5,5)", "two-room"), samples_per_world=1), 60, (0,))
+    kinds, seeds = zip(*drawn, strict=True)
+    assert kinds.count("pillar") + kinds.count("two-room") == 60 and 5 < kinds.count("two-room") < 30
+    assert len(set(seeds)) == 60
+
+
+def test_labels_are_of_shortest_paths_with_the_radius_and_the_margin_of_their_settings(monkeypatch):
+    fields = []
+
+    class Noted(PathField):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            fields.append((self.radius, self.soft_margin))
+
+    monkeypatch.setattr(dataset, "PathField", Noted)
+    make_samples(replace(SETTINGS, radius=0.12, soft_margin=0.07, samples_per_world=1), 2, (0,))
+    assert fields == [(0.12, 0.07)] * 2
 
 
 def test_a_count_that_is_no_multiple_of_the_samples_per_world_is_met():

@@ -18,7 +18,7 @@ from hiernav.nav import goselo  # noqa: E402
 from hiernav.nav.occupancy import OccupancyMap, VisitMap  # noqa: E402
 from hiernav.planner import passes, table  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
-from hiernav.planner.dataset import data_seed  # noqa: E402
+from hiernav.planner.dataset import Samples, data_seed, make_samples  # noqa: E402
 from hiernav.planner.store import DatasetError, write_dataset  # noqa: E402
 from hiernav.planner.train import (  # noqa: E402
     LossWeights,
@@ -28,6 +28,7 @@ from hiernav.planner.train import (  # noqa: E402
     one_cycle,
     plan_loss,
     reflect,
+    torch_planner,
 )
 from hiernav.run import Run, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
@@ -190,6 +191,115 @@ def test_the_best_hypothesis_decides_and_its_score_is_what_learns():
         for which, score in (("best", [0.0, 5.0]), ("other", [5.0, 0.0]))
     }
     assert sure_of["best"] < sure_of["other"] < loss_of(plans[:, :1], torch.zeros(1, 1), batch_of(label))
+
+
+def test_a_hypothesis_that_is_not_the_best_learns_a_twentieth():
+    label = torch.zeros((1, 10, 2))
+    scores = torch.log_softmax(torch.tensor([[0.0, 0.0, 0.0]]), -1)
+    plans = torch.zeros((1, 3, 10, 2), requires_grad=True)
+    apart = plans + torch.tensor([0.3, 0.1, 0.2])[None, :, None, None] * torch.tensor([1.0, 0.0])
+    loss = plan_loss((apart, scores), batch_of(label), LossWeights())
+    squared = [0.09, 0.01, 0.04]
+    assert float(loss.detach()) == pytest.approx(10.0 * 0.01 + 0.5 * sum(squared) / 3 + 0.1 * np.log(3.0))
+    loss.backward()
+    pulls = plans.grad.norm(dim=(2, 3))[0]
+    assert (pulls > 0.0).all() and pulls[1] > 2.0 * pulls[[0, 2]].max()
+
+
+def test_the_headings_of_the_best_hypothesis_are_what_is_compared():
+    label = torch.zeros((2, 10, 2))
+    label[..., 1] = 0.1 * torch.arange(1, 11)
+    scores = torch.zeros((2, 2))
+    plans = torch.stack([torch.stack([label[0].flip(-1), label[0]]), torch.stack([label[1], label[1].flip(-1)])])
+    losses = [loss_of(plans, scores, batch_of(label), heading=weight) for weight in (0.0, 1.0)]
+    assert losses[0] == pytest.approx(losses[1])
+
+
+def test_every_weight_of_the_loss_and_of_the_optimiser_is_the_configured_one(tmp_path):
+    wanted = ("clearance_weight=0.7", "heading_weight=0.4", "soft_margin_m=0.2", "weight_decay=0.03", "mirror=false")
+    trainer = trainer_in(tmp_path / "run", *(f"planner.{text}" for text in wanted), "option.spacing_m=0.2")
+    assert trainer._weights == LossWeights(0.7, pytest.approx(0.1 + 0.3 * 0.2), 0.4, 0.2)
+    assert trainer.optimizer.param_groups[0]["weight_decay"] == 0.03
+    assert (trainer.labels.soft_margin, trainer.labels.spacing, trainer.labels.random_smoothing) == (0.2, 0.2, False)
+    planner = torch_planner(trainer.network, trainer.labels)
+    assert (planner.radius, planner.margin, planner.channels) == (0.1, 0.2, goselo.METRIC_CHANNELS)
+    paper = trainer_in(tmp_path / "paper", "planner.preset=paper", "planner.hypotheses=1")
+    assert paper.labels.random_smoothing and paper.labels.channels == goselo.CHANNELS
+
+
+def random_samples(trainer: PlannerTrainer, count: int) -> Samples:
+    rng, samples = np.random.default_rng(0), Samples.empty(trainer.labels, count)
+    samples.image[:] = rng.integers(0, 256, samples.image.shape)
+    samples.distance[:] = rng.uniform(0.5, 2.0, count)
+    samples.label[:] = rng.uniform(-1.0, 1.0, samples.label.shape)
+    return samples
+
+
+@pytest.mark.parametrize("mirror", [True, False])
+def test_samples_are_reflected_in_training_if_that_is_asked_for_and_never_where_it_is_measured(
+    tmp_path, monkeypatch, mirror
+):
+    trainer = trainer_in(tmp_path / "run", "planner.device=cpu", f"planner.mirror={str(mirror).lower()}")
+    reflected, samples = [], random_samples(trainer, 40)
+
+    def noting(image, label, which):
+        reflected.extend(which.tolist())
+        return reflect(image, label, which)
+
+    monkeypatch.setattr(planner_train, "reflect", noting)
+    trainer._epoch(samples, lambda *_: None)
+    assert len(reflected) == (40 if mirror else 0)
+    assert not mirror or 5 < sum(reflected) < 35
+    reflected.clear()
+    trainer._validate(samples)
+    assert reflected == []
+
+
+def test_an_epoch_takes_the_steps_of_its_schedule_and_tells_the_mean_over_samples(tmp_path, monkeypatch):
+    trainer = trainer_in(tmp_path / "run", "planner.epochs=1")  # 48 samples, 16 of them to a batch
+    losses = iter((1.0, 2.0, 6.0))
+
+    def loss(output, batch, weights):
+        return plan_loss(output, batch, weights) * 0.0 + next(losses)
+
+    monkeypatch.setattr(planner_train, "plan_loss", loss)
+    # batches of 16, 16 and 8
+    assert trainer._epoch(random_samples(trainer, 40), lambda *_: None) == pytest.approx((16 * 1 + 16 * 2 + 8 * 6) / 40)
+    assert trainer.schedule.last_epoch == 3
+
+
+def test_what_is_measured_is_the_chosen_hypothesis_all_along(tmp_path):
+    trainer = trainer_in(tmp_path / "run", "planner.device=cpu")
+    samples = random_samples(trainer, 6)
+    samples.label[:] = 0.0
+    samples.image[:, -1] = 255  # room everywhere
+    plans = torch.zeros((6, 2, 10, 2))
+    plans[:, 0, :, 0] = 0.5
+    plans[:, 1, 5:, 1] = 0.2  # at the label first, then 0.2 m off
+
+    class Sure(torch.nn.Module):
+        channels = trainer.network.channels
+
+        def forward(self, image, distance):
+            return plans[: len(image)], torch.tensor([[-2.0, -0.1]]).repeat(len(image), 1)
+
+    trainer.network = Sure()
+    assert trainer._validate(samples) == {"error": pytest.approx(0.1), "blocked_waypoints": 0.0}
+    samples.image[:, -1] = 0
+    assert trainer._validate(samples)["blocked_waypoints"] == 1.0
+
+
+def test_a_planner_is_measured_on_worlds_that_it_was_not_trained_in(tmp_path, monkeypatch):
+    seen = []
+
+    def noting(*arguments):
+        seen.append(make_samples(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(planner_train, "make_samples", noting)
+    trainer_in(tmp_path / "run", "planner.epochs=1").train()
+    trained, measured = ({bytes(image) for image in samples.image} for samples in seen)
+    assert len(trained) > 40 and len(measured) > 40 and not trained & measured
 
 
 def test_waypoints_near_obstacles_cost_and_those_with_room_do_not():

@@ -580,6 +580,58 @@ def test_drives_that_do_not_differ_clearly_prove_nothing_about_the_planner():
     assert short.endswith("With A* plans it reaches 0.958, no clear difference.")
 
 
+@pytest.mark.parametrize(
+    ("ours", "astar", "told_of_it"),
+    [(900, 990, "part of the cause is the learned planner."), (960, 900, "the learned planner is not the cause.")],
+)
+def test_drives_that_differ_clearly_tell_whether_the_planner_is_the_cause(ours, astar, told_of_it):
+    results = []
+    for name, reached in (("table3/car-shipped", ours), ("astar/car-astar", astar)):
+        drive = made_up.drive(np.random.default_rng(0), 1000) | {
+            "reach_rate": reached / 1000,
+            "reach_ci95": list(wilson_interval(reached, 1000)),
+            "endings": {"goal": reached, "timeout": 1000 - reached},
+        }
+        results.append(made_up.result_of(made_up.CELLS[f"{name}-gremlin"], metrics={"strict": drive}))
+    (short,) = told.shortfalls(book_of(*results), "car")
+    assert short.endswith(told_of_it)
+
+
+@pytest.mark.parametrize(
+    ("rate", "step", "met"), [(0.9, 500_000.0, True), (0.899, 1.0, False), (0.9, 500_001.0, False)]
+)
+def test_a_rate_and_a_number_of_steps_that_are_just_met_are_met(rate, step, met):
+    points = [{"step": 0.5, "reach_rate": 0.1}, {"step": step, "reach_rate": rate}, {"step": 6e5, "reach_rate": 1.0}]
+    result = trained("doggo", "ours", 0, curves={"evaluation": points})
+    assert told.steps_to(result, 0.9) == (step if rate == 0.9 else 6e5)
+    assert told._doggo_steps(book_of(result)).met is met
+
+
+@pytest.mark.parametrize(("rate", "met"), [(told.STRICT_TARGET, True), (0.969, False)])
+def test_a_strict_target_that_is_just_met_is_met(rate, met):
+    drive = made_up.drive(np.random.default_rng(0), 1000) | {"reach_rate": rate}
+    cells = [made_up.CELLS[f"table3/point-shipped-{film_name(parse_world(world))}"] for world in WORLDS]
+    results = [made_up.result_of(cell, metrics={"strict": drive}) for cell in cells]
+    assert told._strict(book_of(*results), "point").met is met
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "met"),
+    [
+        ("reach_rate", 1.0, True),  # the paper's best of gremlin
+        ("reach_rate", 0.995, False),
+        ("steps_mean", 33.7, True),
+        ("steps_mean", 33.8, False),
+    ],
+)
+def test_a_number_is_marked_as_met_or_short_by_the_papers_best(name, value, met):
+    drive = made_up.drive(np.random.default_rng(0), 200) | {name: value}
+    shown = made_up.result_of(made_up.CELLS["table3/doggo-shipped-gremlin"], metrics={"paper": drive, "strict": drive})
+    row = next(row for row in tables.table3(book_of(shown), "doggo", name).split("<tr>") if "gremlin" in row)
+    assert (f'<span class="met">{value:.3f}' in row or f'<span class="met">{value:.1f}' in row) is met
+    assert ('class="short"' in row) is not met
+
+
 def with_reach(rate: float, steps: float = 30.0):
     """Made up results of which the doggo's shipped ones reach as often as said, in so many steps."""
 

@@ -23,6 +23,7 @@ from hiernav.reproduce.queue import Queue
 from hiernav.reproduce.results import read_result, read_results
 from hiernav.reproduce.work import Outcome, driven, run_cell, trained_seconds
 from hiernav.sim.layout import parse_world
+from hiernav.sim.rollout import Episode
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "tools" / "reproduce.py"
@@ -60,6 +61,68 @@ def test_returns_of_a_bundle_are_told_by_a_reward_that_is_given_alone():
     for reward in (None, policies.config.reward):
         found = driven(policies, "pillar(1.2,1.2,1)", settings, lambda *_: None, reward)
         assert {row["return_mean"] is None for row in found.values()} == {reward is None}
+
+
+def test_half_widths_and_steps_between_plans_are_those_of_the_episodes():
+    def episode(steps, collisions, driven, replans, recoveries, reached=True):
+        reason = "goal" if reached else "timeout"
+        return Episode(0, reached, reason, steps, 300, collisions, 0.0, driven, 1.0, replans, 0, recoveries)
+
+    done = [
+        episode(40, 0, 2.0, {"start": 1, "half_index": 3, "goal": 1}, 0),
+        episode(60, 3, 1.0, {"start": 1, "d_update": 1, "goal": 1}, 2),
+        episode(300, 1, 1.0, {"start": 1}, 1, reached=False),
+        episode(20, 0, float("nan"), {"start": 1, "goal": 1}, 0),
+    ]
+    done[3] = replace(done[3], shortest_length=float("nan"))
+    more = work._more(done)
+    # reaching the goal asks for no plan, coming back from a recovery does
+    assert more["steps_between_plans"] == pytest.approx(420 / (4 + 2 + 1 + 1 + 3))
+
+    def half(*values):
+        mean = sum(values) / len(values)
+        spread = sum((value - mean) ** 2 for value in values) / (len(values) - 1)
+        return pytest.approx(1.96 * (spread / len(values)) ** 0.5)
+
+    assert more["steps_half95"] == half(40, 60, 300, 20)
+    assert more["collisions_half95"] == half(0, 3, 1, 0)
+    assert more["spl_half95"] == half(0.5, 1.0, 0.0), "that of the last one is not known"
+    assert work._more(done[:1])["steps_half95"] is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({}, {"planner": "cnn", "repair": True, "recover": True, "predict": True, "period": None, "invalid": True}),
+        ({"repair": False}, {"repair": False}),
+        ({"recover": False}, {"recover": False}),
+        ({"predict": False}, {"predict": False}),
+        ({"invalid": False}, {"invalid": False}),
+        ({"planner": "astar"}, {"planner": "astar", "repair": False}),
+    ],
+)
+def test_a_cell_is_driven_as_its_settings_say(settings, told):
+    found = driven(
+        open_policies(POINT), "pillar(1.2,1.2,1)", {"episodes": 1, "paper_episodes": 1, **settings}, lambda *_: None
+    )
+    for row in found.values():
+        assert row.items() >= told.items()
+
+
+def test_walks_are_along_plans_of_the_network_the_same_verified_and_of_the_expert(places, monkeypatch):
+    asked = []
+
+    def walked(policies, world, planner, repair, episodes, seed, on_episodes):
+        asked.append((str(world), planner, repair, episodes, seed))
+        return {"planner": planner, "repair": repair, "seconds": 1.0}
+
+    monkeypatch.setattr(work, "open_policies", lambda _: None)
+    monkeypatch.setattr(work, "evaluate_plans", walked)
+    cell = next(each for each in catalogue(ROOT) if each.id == "walks/point-two-room")
+    outcome = run_cell(cell, places, lambda *_: None, (None, None))
+    wanted = {"network": ("cnn", False), "verified": ("cnn", True), "astar": ("astar", False)}
+    assert asked == [("two-room", *who, cell.settings["episodes"], work.EVALUATION_SEED) for who in wanted.values()]
+    assert outcome.metrics == {name: {"planner": who[0], "repair": who[1]} for name, who in wanted.items()}
 
 
 def test_a_fixed_period_is_what_lies_between_plans():

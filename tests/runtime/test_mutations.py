@@ -173,7 +173,7 @@ MUTANTS = (
            "elif supervisor.mode is Mode.ARMED and 0.0 >", f"{T}/test_terms.py"),
     Mutant("hold without a way", WATCH, "waited > self.hold_after else", "False else",
            f"{F}/test_26_obstacle_moves_in.py"),
-    Mutant("stop in time", WATCH, "if now - self._since > self.timeout:", "if False:", f"{T}/test_driver.py"),
+    Mutant("stop in time", WATCH, "now - self._since > self.timeout:", "False:", f"{T}/test_driver.py"),
     Mutant("rehearsal that takes too long", f"{R}/loop.py", "if self._spoilt >= SPOILT:", "if False:",
            f"{T}/test_loop.py"),
     Mutant("policies of another rate", f"{R}/driver.py", "if not math.isclose(trained,",

@@ -126,6 +126,22 @@ def test_steps_in_contact_are_counted() -> None:
     assert episodes[1].collisions == 0
 
 
+def test_the_driven_length_and_the_return_are_those_of_every_step() -> None:
+    task, steps = make_task(TrainConfig(), 1, worlds=[WORLD]), []
+    layouts = [capped(layout_of(start=(-1.0, -1.0, 0.0)), 20)]
+    episode = run_episodes(
+        task, ahead, layouts, on_step=lambda step: steps.append((float(task.pose[0, 0]), float(step.reward[0])))
+    )[0]
+    places, rewards = zip(*steps, strict=True)
+    assert episode.path_length == pytest.approx(places[-1] + 1.0, rel=1e-3)
+    assert episode.return_ == pytest.approx(sum(rewards)) and len(rewards) == 20
+
+
+def test_a_robot_that_stood_still_in_the_last_episode_is_helped_in_the_next_as_if_in_its_first() -> None:
+    episodes = run(stand, [capped(layout_of(start=(-1.0, -1.0, 0.0)), 160)] * 2, num_rows=1)
+    assert [episode.recoveries for episode in episodes] == [1, 1]
+
+
 def test_fewer_layouts_than_rows_are_driven_once() -> None:
     episodes = run(stand, [capped(layout_of(start=(-1.0, -1.0, 0.0)), 5, seed=7)], num_rows=4)
     assert [episode.seed for episode in episodes] == [7]

@@ -118,6 +118,18 @@ def test_the_cap_truncates_and_does_not_terminate() -> None:
     assert not step.terminated.any()
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_a_robot_on_its_back_ends_its_training_episode_and_no_evaluation(training: bool) -> None:
+    task = make_task(load_config(None, ["robot=doggo"]), 1, Straight(), [WORLD], training=training)
+    task.reset(layouts=[facing_goal()])
+    for task.steps[0] in (10, 299):
+        task.sim.datas[0].qpos[3:7] = (0.0, 1.0, 0.0, 0.0)
+        step = still(task)
+        assert step.terms["fall"][0] == 1.0
+        assert (step.fallen[0], step.terminated[0]) == (training, training)
+        assert step.truncated[0] == (task.steps[0] == 300 and not training)
+
+
 def test_a_robot_that_reaches_the_goal_in_the_last_step_has_reached_it() -> None:
     task = task_of(facing_goal())
     task.steps[:] = 299
@@ -210,6 +222,17 @@ def test_gremlins_move_in_the_map_and_in_the_lidar() -> None:
     position = 0.3 * np.array([np.cos(task.sim.time[0]), np.sin(task.sim.time[0])])
     assert task._maps[0].occupied_at(position)
     assert not np.allclose(step.observation[0, task.layout.slices["lidar"]], lidar)
+
+
+def test_what_stood_in_the_last_world_is_not_seen_in_the_next() -> None:
+    task = task_of(facing_goal(pillars=[(-1.0, 0.9), (-0.2, 1.5)]))
+    lidar = task.layout.slices["lidar"]
+    assert (task.observation[0, lidar] > 0.0).sum() > 2
+    task.reset(layouts=[facing_goal(pillars=[(-0.2, 1.5)])])
+    alone = task_of(facing_goal(pillars=[(-0.2, 1.5)]))
+    assert_allclose(task.observation[0, lidar], alone.observation[0, lidar])
+    task.reset(layouts=[facing_goal()])
+    assert not task.observation[0, lidar].any() and not still(task).observation[0, lidar].any()
 
 
 def test_training_may_cut_episodes_short_and_evaluation_does_not() -> None:

@@ -102,14 +102,22 @@ def test_all_worlds_are_drawn() -> None:
 def test_the_task_is_built_as_configured() -> None:
     config = load_config(
         None,
-        ["robot=car", "option.d_update_m=0.4", "option.period=8", "option.waypoints=10", "planner.soft_margin_m=0.05"],
+        [
+            "robot=car",
+            "option.d_update_m=0.4",
+            "option.period=8",
+            "option.spacing_m=0.08",
+            "planner.soft_margin_m=0.05",
+        ],
     )
     task = make_task(config, 3)
     assert task.robot.name == "car" and task.num_rows == 3
     assert replan_rule(config).d_update == 0.4 and replan_rule(config).period == 8
     assert task.option.rule == replan_rule(config)
+    assert (task.option.sweep_radius, task.option.goal_radius) == (0.2, 0.3)
+    assert task.option.refresh == 5, "0.2 s of 25 Hz"
     planner = expert_planner(config)
-    assert (planner.radius, planner.soft_margin) == (0.2, 0.05)
+    assert (planner.radius, planner.soft_margin, planner.spacing) == (0.2, 0.05, 0.08)
     assert expert_planner(load_config(None, ["planner.planning_radius_m=0.15"])).radius == 0.15
     with pytest.raises(ConfigError, match=r"planning_radius_m = 0.04, expected at least 0.1, the radius of the point"):
         expert_planner(load_config(None, ["planner.planning_radius_m=0.04"]))

@@ -8,7 +8,7 @@ import pytest
 
 from hiernav.config import load_config
 from hiernav.sim.layout import parse_world
-from hiernav.skill.collect import segment_frames, training_layouts, training_worlds
+from hiernav.skill.collect import random_batches, segment_frames, training_layouts, training_worlds
 
 pytestmark = pytest.mark.train
 
@@ -51,6 +51,49 @@ def test_a_segment_leaves_every_simulation_the_steps_of_an_episode(
     assert segment_frames(skill, 0) == frames
     assert segment_frames(skill, skill.total_steps - 32) == 32
     assert segment_frames(skill, skill.total_steps - frames - 32) == frames + 32, "no segment of a step or two"
+
+
+def test_as_many_batches_are_random_as_learning_waits_for() -> None:
+    config = load_config(None, ["skill.learning_starts=100"])
+    assert [random_batches(config, steps, 64) for steps in (0, 36, 64, 99, 100, 128)] == [2, 1, 1, 1, 0, 0]
+
+
+def test_until_learning_starts_actions_are_drawn_at_random_and_then_by_the_policy() -> None:
+    torch = pytest.importorskip("torch")
+    from hiernav.skill.collect import LocalBatches
+    from hiernav.skill.train import make_learner
+
+    torch.manual_seed(0)
+    small = ["device=cpu", "num_envs=2", "total_steps=32", "batch_size=8", "hidden=[8, 8]", "learning_starts=16"]
+    learner = make_learner(config := load_config(None, [f"skill.{text}" for text in small]))
+    with torch.no_grad():  # a policy that stands still
+        learner.actor.head.weight.zero_()
+        learner.actor.head.bias.copy_(torch.tensor([0.0, 0.0, -9.0, -9.0]))
+    batches = LocalBatches(config, learner.policy)
+    sizes = [float(torch.cat(list(batches.segment(steps, 16)))["action"].abs().mean()) for steps in (0, 16)]
+    batches.close()
+    assert sizes[1] < 0.05 < 0.3 < sizes[0]
+
+
+def test_training_episodes_end_as_the_skill_s_settings_say() -> None:
+    pytest.importorskip("torch")
+    from hiernav.skill.collect import LocalBatches
+    from hiernav.skill.train import make_learner
+
+    for robot, ends in (("point", "true"), ("doggo", "false"), ("doggo", "true")):
+        config = load_config(
+            None,
+            [
+                f"robot={robot}",
+                "skill.num_envs=1",
+                f"skill.end_on_fall={ends}",
+                "skill.episode_steps=7",
+                "skill.device=cpu",
+            ],
+        )
+        batches = LocalBatches(config, make_learner(config).policy)
+        assert batches.task.end_on_fall == (ends == "true") and batches.task._cap == 7
+        batches.close()
 
 
 def test_every_segment_and_every_worker_has_episodes_of_its_own() -> None:

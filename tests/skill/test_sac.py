@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
 pytestmark = pytest.mark.train
@@ -339,6 +341,21 @@ def test_the_temperature_is_lifted_to_its_floor() -> None:
     assert float(learner.loss._alpha) == pytest.approx(3.0)
 
 
+def test_every_setting_of_the_skill_s_training_reaches_its_learner() -> None:
+    wanted = {
+        "hidden": (24, 8), "discount": 0.9, "tau": 0.02, "learning_rate": 1e-3, "init_alpha": 0.3, "alpha_floor": 0.02,
+        "target_entropy": -0.5, "actor_average": 7, "layer_norm": True, "precision": "float32",
+    }  # fmt: skip
+    texts = {**wanted, "hidden": "[24, 8]", "layer_norm": "true"}
+    made = make_learner(load_config(None, ["skill.device=cpu", *(f"skill.{k}={text}" for k, text in texts.items())]))
+    assert asdict(made.settings) == wanted
+    assert float(made.loss.value_estimator.gamma) == pytest.approx(0.9)
+    assert float(made.loss.target_entropy) == -0.5
+    assert float(made.loss._alpha) == pytest.approx(0.3)
+    assert made.average is not made.actor
+    assert made.loss.qvalue_network_params["module", "trunk", "layers", "1", "weight"].shape == (2, 24), "a layer norm"
+
+
 def test_the_exported_actor_is_the_mean_of_the_last_ones() -> None:
     one = learner(SacSettings(hidden=(16, 16), actor_average=4))
     assert one.average is not one.actor
@@ -352,6 +369,18 @@ def test_the_exported_actor_is_the_mean_of_the_last_ones() -> None:
     other = learner(SacSettings(hidden=(16, 16), actor_average=4), seed=1)
     other.load_state_dict(one.state_dict())
     assert_close(other.average.head.weight, one.average.head.weight)
+
+
+def test_the_average_forgets_what_lies_farther_back_than_it_is_long() -> None:
+    one, seen = learner(SacSettings(hidden=(16, 16), actor_average=2)), []
+    for seed in range(4):
+        one.update(batch(seed))
+        seen.append(one.actor.head.weight.detach().clone())
+    one.publish()
+    mean = (seen[0] + seen[1]) / 2
+    for last in seen[2:]:
+        mean = (mean + last) / 2
+    assert_close(one.average.head.weight, mean)
 
 
 def test_without_averaging_the_last_actor_is_exported() -> None:

@@ -14,9 +14,14 @@ import tiny_run
 torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
+from tensordict import TensorDict  # noqa: E402
+
+from hiernav.nav.mirror import mirror_of  # noqa: E402
 from hiernav.nav.option import Planner  # noqa: E402
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner, VerifiedPlanner  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
+from hiernav.sim.robots import get_robot  # noqa: E402
+from hiernav.sim.rollout import Episode  # noqa: E402
 from hiernav.skill import train as skill_train  # noqa: E402
 from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, kept, load_actor  # noqa: E402
 
@@ -284,6 +289,79 @@ def test_the_critics_learn_from_scaled_rewards_and_the_log_shows_unscaled_ones(t
     assert rewards[1.0].abs().max() > 0.0
     torch.testing.assert_close(rewards[8.0], 8.0 * rewards[1.0], rtol=1e-6, atol=0)
     assert logged[1.0] == logged[8.0] != {}
+
+
+def ready_to_learn(folder: Path, *overrides: str) -> SkillTrainer:
+    """A trainer in the middle of its training, whose replay holds transitions that nobody has driven."""
+    trainer = trainer_in(folder, "skill.device=cpu", *overrides)
+    rng = torch.Generator().manual_seed(0)
+
+    def drawn(size: int) -> torch.Tensor:
+        return torch.rand(64, size, generator=rng) * 2.0 - 1.0
+
+    ended = torch.zeros(64, 1, dtype=torch.bool)
+    following = {"observation": drawn(42), "reward": drawn(1), "done": ended, "terminated": ended}
+    transitions = {"observation": drawn(42), "action": drawn(2), "next": TensorDict(following, [64])}
+    trainer.replay.extend(TensorDict(transitions, [64]))
+    trainer.steps = 600
+    return trainer
+
+
+@pytest.mark.parametrize("mirror", [True, False])
+def test_batches_are_reflected_by_half_if_that_is_asked_for(tmp_path, monkeypatch, mirror):
+    trainer, learnt = ready_to_learn(tmp_path / "run", f"skill.mirror={str(mirror).lower()}"), []
+    monkeypatch.setattr(trainer.learner, "update", lambda batch: learnt.append(batch) or {})
+    rows = torch.arange(32)
+    trainer._learn_from(rows)
+    drawn, sides = trainer.replay.batch(rows), mirror_of("point", get_robot("point").observation_layout())
+    for key, turned in (
+        ("observation", sides.observation),
+        (("next", "observation"), sides.observation),
+        ("action", sides.action),
+    ):
+        first = turned(drawn[key][:16].numpy()) if mirror else drawn[key][:16].numpy()
+        np.testing.assert_array_equal(learnt[0][key][:16].numpy(), first)
+        assert torch.equal(learnt[0][key][16:], drawn[key][16:])
+
+
+def test_the_floor_of_the_temperature_falls_as_training_goes_on(tmp_path):
+    falling = ("skill.alpha_floor=0.05", "skill.alpha_floor_end=0.005", "skill.alpha_fall=[0.0, 1.0]")
+    trainer, floors = ready_to_learn(tmp_path / "run", *falling, "skill.total_steps=1200"), []
+    for trainer.steps in (600, 1200):
+        assert trainer._update(20) != {}
+        floors.append(float(trainer.learner.loss.min_log_alpha.exp()))
+    assert floors == pytest.approx([0.05 * 10**-0.5, 0.005], rel=1e-4)
+
+
+def test_every_evaluation_drives_the_averaged_actor_by_the_protocol_in_the_same_worlds(tmp_path, monkeypatch):
+    """The second one finds robots that never arrive, so the actor of the first is kept, as it was then."""
+    driven = []
+
+    def drive(task, skill, layouts):
+        driven.append((task, skill.actor, [layout.seed for layout in layouts]))
+        arrives = len(driven) % 2 == 1
+        return [Episode(k, arrives and k > 0, "goal", 20, 180, 0, 1.0, 1.0, 1.0, {}, 0, 0) for k in range(len(layouts))]
+
+    monkeypatch.setattr(skill_train, "run_episodes", drive)
+    for seed in (3, 4):
+        trainer = ready_to_learn(
+            tmp_path / f"{seed}", f"seed={seed}", "skill.episode_steps=10", "skill.eval_episodes=20"
+        )
+        trainer._update(200)
+        trainer._evaluate()
+        evaluated = {key: value.clone() for key, value in trainer.learner.average.state_dict().items()}
+        trainer._update(200)
+        trainer.steps = 700
+        trainer._evaluate()
+        assert not torch.equal(trainer.learner.average.head.bias, evaluated["head.bias"]), "it has gone on learning"
+        assert all(torch.equal(trainer.best_actor[key], value) for key, value in evaluated.items())
+        assert trainer.evaluations[0]["reach_rate"] == 0.95
+        assert trainer.evaluations[0]["steps_mean"] == (180 + 19 * 20) / 20, "a failure counts the cap"
+        for task, actor, _ in driven[-2:]:
+            assert actor is trainer.learner.average is not trainer.learner.actor
+            assert not task.end_on_fall and task._cap > 180, "what cuts training episodes short cuts no others"
+    first, again, other, _ = (seeds for _, _, seeds in driven)
+    assert first == again and len(set(first)) == 20 and not set(first) & set(other)
 
 
 def test_another_seed_is_another_run(tmp_path, straight):
