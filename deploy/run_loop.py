@@ -176,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--world", help=f"kind of world, or a map's YAML ({WORLD}; with --adapter there is no default)")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next ones count up (0)")
     parser.add_argument("--episodes", type=int, default=1, metavar="N", help="how many worlds to cross (1)")
-    parser.add_argument("--goal", metavar="X,Y", help="goal in the world frame [m]; the world's own by default")
+    parser.add_argument("--goal", metavar="X,Y", help="goal in the world frame [m]; a simulated world has its own")
     parser.add_argument("--exact", action="store_true", help="sensors without noise")
     parser.add_argument("--adapter", metavar="FILE.py:FUNCTION", help="makes your robot (deploy/README.md)")
     parser.add_argument("--planner", choices=("process", "sync"), help="where plans are made (process; sync if --fast)")
@@ -384,7 +384,7 @@ class Episodes:
                     _complain(" ".join(str(error).split()))
                     break
                 if self.driver.supervisor.latched:  # a simulated robot is as good as new; a real one is for people
-                    self.faults.open = None  # by nobody
+                    self.faults.open.clear()  # by nobody
                     self.driver.supervisor.acknowledge(self.driver.clock.now())
             if self.interrupted:
                 break
@@ -406,7 +406,7 @@ class Episodes:
         finally:
             self.goals.take_result()
         if not (self.driver.stopped or self._at_fault()):
-            self.faults.open = self.account.add_fault("the robot was not seen to stand", self.driver.clock.now())
+            self.faults.open.append(self.account.add_fault("the robot was not seen to stand", self.driver.clock.now()))
 
     def _account_for(self, go: Callable[[list[Drive]], None]) -> int:
         """Drive, and show and save the account of it, wherever a signal arrives; pictures alone can be spared."""
@@ -453,7 +453,7 @@ class Episodes:
             return True
         if not self.serves:
             return any(episode.result.fault for episode in self.account.episodes)
-        return self.faults.open is not None or self.driver.supervisor.mode is Mode.FAULT
+        return bool(self.faults.open) or self.driver.supervisor.mode is Mode.FAULT
 
     def _finish(self, drives: Sequence[Drive]) -> int:
         """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""

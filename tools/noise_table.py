@@ -96,6 +96,9 @@ class RawEstimator:
         """As of `Estimator`; here nothing is given where a sensor says nothing."""
         return 0.0
 
+    def hears(self, sensor: str) -> bool:
+        return True
+
     def update(self, frame: SensorFrame) -> Estimate | None:
         if frame.position_fix is not None:
             self._fix = frame.position_fix

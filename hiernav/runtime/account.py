@@ -85,18 +85,17 @@ class FaultWatch(Observer):
 
     def __init__(self, account: Account) -> None:
         self.account = account
-        self.open: Fault | None = None
-        """The one that nobody has acknowledged, whatever came on top of it."""
+        self.open: list[Fault] = []
+        """Those that nobody has acknowledged."""
 
     def event(self, event: Event) -> None:
         mode = event.values.get("mode")
-        if event.kind == "fault":
-            fault = self.account.add_fault(event.text, event.time)
-            self.open = self.open or fault
-        elif mode == Mode.FAULT.value:
-            self.open = self.account.add_fault(event.text, event.time)
-        elif mode == Mode.INIT.value and self.open is not None:  # out of FAULT and ESTOP nothing else leads there
-            self.open.acknowledged, self.open = True, None
+        if event.kind == "fault" or mode == Mode.FAULT.value:
+            self.open.append(self.account.add_fault(event.text, event.time))
+        elif mode == Mode.INIT.value:  # out of FAULT and ESTOP nothing but an acknowledgement leads there
+            for fault in self.open:
+                fault.acknowledged = True
+            self.open.clear()
 
 
 class GoalWatch(Observer):

@@ -288,7 +288,8 @@ class Driver:
         self._unshown: _Seen | None = None
         self._occupancy: OccupancyMap | None = None
         self._loop_ticks = self.loop.ticks
-        self._terms = TermHold()
+        self._terms = TermHold(self.pilot.sizes)
+        self.estimator.skill_terms, self.estimator.driven = self.pilot.sizes, False
         config, trust = self.config, self.estimator.config
         self._blind = BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate)
         self._overruns = OverrunWatch()
@@ -296,7 +297,10 @@ class Driver:
         self._no_way = BlockedWatch(0.0, config.no_way_at_start)
         self._saturation = SaturationWatch(self.robot.action_dim, self.robot.control_period)
         self._standing = StopWatch(config.stop_speed, config.stop_turn, config.stop_timeout)
-        self._acknowledged = False
+        self._acknowledged = not self.stopped
+        if self._acknowledged:
+            self._standing.begin(now)
+        self._driven = False
         self.estimator.reset()
         self.last_result = None
         _warm_up(self.estimator.config)
@@ -346,6 +350,8 @@ class Driver:
             self._step(now)
         except Exception as error:
             self._take_failure(error, now)
+            self.estimator.driven = False
+            self._standing.postpone(now)  # what cannot be read cannot be seen to stand
             self.robot.brake()
             self._show(now)  # what the estimator has taken must not be missing in a recording
         return self.gone is not None or (not self._serving and self._trip is None)
@@ -400,6 +406,7 @@ class Driver:
         if supervisor.driving and seen.decision is not None and estimate is not None and seen.occupancy is not None:
             seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, now)
             guarded = True
+        self.estimator.driven = seen.sent is not None
         if seen.sent is None:
             self.robot.brake()
             fallen = None if guarded else self.guard.braked(None if estimate is None else estimate.upright)
@@ -485,8 +492,6 @@ class Driver:
     def _choose_mode(self, trip: Trip, decision: Decision | None, wait: str | None, stamp: float, now: float) -> None:
         """What the robot may do in this tick, `wait` being why it must not move, if so."""
         supervisor = self.supervisor
-        if self._acknowledged and self._standing.stands:
-            self._acknowledged = False
         if self._acknowledged:
             wait = "the robot has not been seen to stand since the fault"
         if self._paused:
@@ -569,6 +574,7 @@ class Driver:
                 return None, guarded.scale
             self.pilot.recover()
         sent = self.robot.send(guarded.action)
+        self._driven = True
         self.timer.mark("send")
         if self._trip is not None:
             self._trip.steps += 1
@@ -602,7 +608,8 @@ class Driver:
         trip, supervisor = self._trip, self.supervisor
         if trip is None:  # the robot was braked before
             return
-        self._standing.begin(now)
+        if supervisor.driving or self._standing.stands:  # else it is being looked at already
+            self._standing.begin(now)
         trip.reason, trip.detail = reason, detail
         if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
             supervisor.change(Mode.READY, reason, now)
@@ -612,18 +619,25 @@ class Driver:
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:
         """Follow a robot that was braked until it stands; one that does not stop is a fault."""
-        stands = self._standing.check(estimate, now, self._speed_is_measured())
+        if estimate is None and not self._driven:
+            self._standing.postpone(now)  # it has not been driven, and nothing of it is known yet
+        stands = self._standing.check(estimate, now, *self._measured())
         if stands is None:
             return
         self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
-        if not stands:
+        if stands:
+            self._acknowledged = False
+        else:
             self._does_not_stop(now)
         if self._ended is not None and self._serving:
             self.last_result, self._ended = self._result(self._ended, stands), None
 
-    def _speed_is_measured(self) -> bool:
-        """Whether the velocimeter says something, if the robot has one."""
-        return self.estimator.silence("velocimeter") < self.estimator.config.hold_after
+    def _measured(self) -> tuple[bool, bool, bool]:
+        """Whether speed and turning rate are those that sensors say, if the robot has them, and whether it has both."""
+        estimator = self.estimator
+        patience = estimator.config.hold_after
+        speed, turn = (estimator.silence(name) < patience for name in ("velocimeter", "gyro"))
+        return speed, turn, estimator.hears("velocimeter") and estimator.hears("gyro")
 
     def _does_not_stop(self, now: float) -> None:
         self._fail(f"the robot does not stop within {self.config.stop_timeout:g} s", now)
@@ -645,6 +659,7 @@ class Driver:
         self.guard.reset()
         self.pilot.renew()
         self._blind.renew(now)
+        self.estimator.renew()
         self._standing.begin(now)
         self._acknowledged = True
 
@@ -720,7 +735,7 @@ class Driver:
         def tick(now: float) -> bool:
             nonlocal stopped
             self._estimate = self.estimator.update(self.robot.read())
-            stopped = watch.check(self._estimate, now, self._speed_is_measured())
+            stopped = watch.check(self._estimate, now, *self._measured())
             if stopped is None:
                 self.robot.brake()
             return stopped is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,9 @@ from hiernav.runtime.robot import READINGS, SIZES, SensorFrame
 from hiernav.runtime.settings import Settings
 from hiernav.runtime.timing import Histogram
 
-LOOK = 2.5
-"""For how long a robot is listened to [s]: longer than its fixes may stay away."""
+LOOK, PATIENCE = 2.5, 15.0
+"""For how long a robot is listened to [s]: longer than its fixes may stay away, and until each sensor that it needs has
+spoken, at most so long."""
 ESTIMATOR_NEEDS = ("position_fix", "magnetometer")
 WAKES = 200
 PERIOD = 0.005
@@ -82,16 +83,16 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
 def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings) -> dict[str, Any]:
     if bundle is not None:
         require_fit(bundle, robot)
-    frames = _look(robot)
+    needed = [*ESTIMATOR_NEEDS, *(() if bundle is None else (n for n in bundle.layout.names if n not in GUIDES))]
+    frames, seconds = _look(robot, needed)
     given: dict[str, list[np.ndarray]] = {}
     for frame in frames:
         for name, value in _readings(frame).items():
             given.setdefault(name, []).append(np.asarray(value, dtype=np.float64))
-    needed = [*ESTIMATOR_NEEDS, *(() if bundle is None else (n for n in bundle.layout.names if n not in GUIDES))]
     silent = [name for name in dict.fromkeys(needed) if name not in given]
     broken = [name for name, values in given.items() if not any(np.isfinite(value).all() for value in values)]
     stamps = np.array([frame.stamp for frame in frames])
-    errors = [f"silent for {LOOK:g} s: {', '.join(silent)}"] if silent else []
+    errors = [f"silent for {seconds:.1f} s: {', '.join(silent)}"] if silent else []
     errors += [f"never finite: {', '.join(broken)}"] if broken else []
     if not (np.isfinite(stamps).all() and (np.diff(stamps) > 0.0).any()):
         errors.append(f"stamps do not advance: {stamps[0]:g} to {stamps[-1]:g} s")
@@ -108,7 +109,7 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings)
     return {
         "control period": f"{1e3 * robot.control_period:g} ms",
         "actuators": robot.action_dim,
-        "frames": f"{len(frames)} in {LOOK:g} s",
+        "frames": f"{len(frames)} in {seconds:.1f} s",
         "sensors": ", ".join(given) or "missing",
         "silent": f"missing: {', '.join(absent)}" if absent else "none",
         "not finite": f"missing: {', '.join(broken)}" if broken else "none",
@@ -117,16 +118,18 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings)
     }
 
 
-def _look(robot: ProcessRobot) -> list[SensorFrame]:
-    """The frames that a robot shows in LOOK seconds."""
+def _look(robot: ProcessRobot, needed: Sequence[str]) -> tuple[list[SensorFrame], float]:
+    """The frames that a robot shows, and how long it was listened to [s]."""
     clock = MonotonicClock()
-    frames, end = [robot.read()], clock.now() + LOOK
-    while clock.now() < end:
-        clock.sleep_until(min(clock.now() + robot.control_period, end))
+    began, frames = clock.now(), [robot.read()]
+    missing = set(needed) - set(_readings(frames[0]))
+    while (now := clock.now()) < began + (PATIENCE if missing else LOOK):
+        clock.sleep_until(now + robot.control_period)
         frame = robot.read()
         if frame is not frames[-1]:
             frames.append(frame)
-    return frames
+            missing -= set(_readings(frame))
+    return frames, clock.now() - began
 
 
 def _readings(frame: SensorFrame) -> dict[str, np.ndarray]:

