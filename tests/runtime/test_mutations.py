@@ -182,7 +182,7 @@ MUTANTS = (
            "tests/test_run_loop.py"),
     Mutant("golden values", f"{R}/policy.py", "    check_golden(bundle, policies)\n", "    pass\n",
            f"{T}/test_policy.py"),
-    Mutant("fault without a goal", f"{R}/account.py", "if mode == Mode.FAULT.value:", "if False:",
+    Mutant("fault without a goal", f"{R}/account.py", 'if event.kind == "fault" or mode == Mode.FAULT.value:', "if False:",
            f"{T}/test_account.py"),
 )  # fmt: skip
 
