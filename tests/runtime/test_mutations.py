@@ -152,8 +152,8 @@ MUTANTS = (
            f"{T}/test_driver.py"),
     Mutant("robot that moves again", f"{R}/watchdogs.py", "self._since, self._told = now, False\n        if not",
            "self._told = True\n        if not", f"{T}/test_driver.py"),
-    Mutant("goal of a robot that rolls", f"{R}/driver.py", "if self._acknowledged:\n            wait", "if False:\n            wait",
-           f"{T}/test_driver.py"),
+    Mutant("goal of a robot that rolls", f"{R}/driver.py", "if self._acknowledged:\n            wait",
+           "if False:\n            wait", f"{T}/test_driver.py"),
     Mutant("fault upon a fault", f"{R}/supervisor.py", "kind in self._kinds or", "True or", f"{T}/test_supervisor.py"),
     Mutant("frozen lidar", f"{R}/freshness.py", "way > max(TRAVEL, SPARE", "way > max(math.inf, SPARE",
             f"{F}/test_02_frozen_value.py"),
@@ -182,8 +182,8 @@ MUTANTS = (
            "tests/test_run_loop.py"),
     Mutant("golden values", f"{R}/policy.py", "    check_golden(bundle, policies)\n", "    pass\n",
            f"{T}/test_policy.py"),
-    Mutant("fault without a goal", f"{R}/account.py", 'if event.kind == "fault" or mode == Mode.FAULT.value:', "if False:",
-           f"{T}/test_account.py"),
+    Mutant("fault without a goal", f"{R}/account.py", 'if event.kind == "fault" or mode == Mode.FAULT.value:',
+           "if False:", f"{T}/test_account.py"),
 )  # fmt: skip
 
 
