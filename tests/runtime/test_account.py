@@ -20,11 +20,11 @@ from rich.console import Console
 from run_loop_script import load_script
 from shipped import RUN_LOOP
 
-from hiernav.runtime.account import KEPT, Account, Episode
+from hiernav.runtime.account import KEPT, Account, Episode, FaultWatch
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.loop import FixedRateLoop
-from hiernav.runtime.observe import Observer
+from hiernav.runtime.observe import Event, Observer
 from hiernav.runtime.robot import RobotGone
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import print_summary, summarise
@@ -383,6 +383,20 @@ def account_of(ends: int, kept: int | None = None) -> Account:
 def summary_of(account: Account, loop: FixedRateLoop | None = None, timer: TickTimer | None = None) -> dict[str, Any]:
     loop = loop or FixedRateLoop(FakeClock(), 0.1, lambda _: True, lambda: None)
     return summarise(account, timer or TickTimer(), loop, {})
+
+
+def test_an_acknowledgement_is_one_of_all_that_had_gone_wrong():
+    account = Account()
+    watch = FaultWatch(account)
+    for kind, text, mode in (
+        ("mode", "pressed", "estop"), ("fault", "does not stop", None), ("mode", "acknowledged", "init"),
+        ("mode", "bus error", "fault"), ("fault", "gone", None),
+    ):  # fmt: skip
+        watch.event(Event(1.0, kind, text, {"mode": mode}))
+    assert [(fault.why, fault.acknowledged) for fault in account.faults] == [
+        ("does not stop", True), ("bus error", False), ("gone", False),
+    ]  # fmt: skip
+    assert watch.open == list(account.faults)[1:]
 
 
 def test_of_many_goals_and_faults_the_newest_are_named_and_all_are_counted():

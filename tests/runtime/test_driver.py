@@ -18,7 +18,7 @@ from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver, DriverConfig
 from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
 from hiernav.runtime.guard import Guard, GuardConfig
-from hiernav.runtime.observe import Observer, TickRecord
+from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.robot import RobotGone, SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.summary import print_summary, summarise
@@ -283,6 +283,41 @@ def test_a_loop_that_begins_again_does_not_drive_a_robot_that_was_not_seen_to_st
     sent = len(robot.sent)
     result = driver.run(-GOAL)
     assert result.fault == "the robot does not stop within 0.5 s" and len(robot.sent) == sent
+
+
+def test_a_turning_rate_that_no_gyro_says_any_more_does_not_keep_a_robot_from_standing():
+    watch, seen = StopWatch(0.1, 1.0, 3.0), []
+    watch.begin(0.0)
+    for k in range(20):
+        estimate = Estimate(0.02 * k, np.zeros(3), np.zeros(2), np.eye(6), 1.0, 1.5)
+        seen.append(watch.check(estimate, 0.02 * k, turn_measured=False))
+    assert seen.count(True) == 1
+
+
+def test_a_robot_that_stood_while_it_could_not_be_read_is_not_one_that_does_not_stop():
+    robot, faults = Puck(), []
+
+    class Operator(Observer):
+        def make_requests(self) -> None:
+            at = len(robot.log)
+            if at == 21:  # a reading and a brake in every tick before
+                driver.set_goal(GOAL)
+            elif at > 400:
+                driver.quit()
+
+        def event(self, event: Event) -> None:
+            if event.kind in ("fault", "stop") or event.values.get("mode") == "fault":
+                faults.append(event.text)
+
+    def sees(frame: SensorFrame) -> SensorFrame:
+        if 50 < len(robot.log) < 200:
+            raise OSError("bus error")
+        return frame
+
+    robot.sees = sees
+    driver = driver_of(robot, config=DriverConfig(stop_timeout=1.0), observers=[Operator()])
+    driver.serve()
+    assert faults[-2:] == ["OSError: bus error", "the robot stands"] and driver.stopped
 
 
 def test_a_robot_without_a_velocimeter_is_not_told_to_move_by_the_noise_of_its_fixes():
