@@ -37,6 +37,11 @@ class ObservationLayout:
         return tuple(term.name for term in self.terms)
 
     @property
+    def sensors(self) -> dict[str, int]:
+        """Name and size of the terms that a robot's sensors give, which are all but `GUIDES`."""
+        return {term.name: term.size for term in self.terms if term.name not in GUIDES}
+
+    @property
     def scale(self) -> np.ndarray:
         """(D,) float32, factor of each value."""
         return np.concatenate([np.full(t.size, t.scale, dtype=np.float32) for t in self.terms])

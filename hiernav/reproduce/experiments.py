@@ -85,8 +85,8 @@ TRAINING = {
     "learned-plans": ["skill.planner=cnn"],
     "world-frame": ["skill.waypoint_frame=world"],
 }
-"""Departures that have to be trained without (`layer-norm` and `learned-plans`: with). One that changes nothing for a
-robot is left out for it."""
+"""Departures that have to be trained without (`layer-norm`, `learned-plans` and `world-frame`: with). One that changes
+nothing for a robot is left out for it."""
 OF_LEGS = ("no-tilt-cost", "go-on-after-fall", "no-clock", "no-time-cost")
 """Departures that are left out with the quadruped instead."""
 NEUTRAL = {"waypoint_frame": "body"}

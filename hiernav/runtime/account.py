@@ -142,6 +142,6 @@ class GoalWatch(Observer):
             result = replace(result, fault=result.detail)  # it was acknowledged before the robot was seen to stand
         collisions, distance = None, None
         if self._truth is not None:
-            collisions = self._truth.collisions - (self._truth.collisions if self._before is None else self._before)
+            collisions = 0 if self._before is None else self._truth.collisions - self._before
             distance = float(np.linalg.norm(self._truth.pose[:2] - trip.goal))
         self.account.add(Episode(self.seed, result, collisions, distance))

@@ -297,8 +297,8 @@ class Driver:
         self._no_way = BlockedWatch(0.0, config.no_way_at_start)
         self._saturation = SaturationWatch(self.robot.action_dim, self.robot.control_period)
         self._standing = StopWatch(config.stop_speed, config.stop_turn, config.stop_timeout)
-        self._acknowledged = not self.stopped
-        if self._acknowledged:
+        self._must_stand = not self.stopped  # before any goal is driven to
+        if self._must_stand:
             self._standing.begin(now)
         self._driven = False
         self.estimator.reset()
@@ -492,7 +492,7 @@ class Driver:
     def _choose_mode(self, trip: Trip, decision: Decision | None, wait: str | None, stamp: float, now: float) -> None:
         """What the robot may do in this tick, `wait` being why it must not move, if so."""
         supervisor = self.supervisor
-        if self._acknowledged:
+        if self._must_stand:
             wait = "the robot has not been seen to stand since the fault"
         if self._paused:
             wait, self._held_since = "paused", now
@@ -626,7 +626,7 @@ class Driver:
             return
         self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
         if stands:
-            self._acknowledged = False
+            self._must_stand = False
         else:
             self._does_not_stop(now)
         if self._ended is not None and self._serving:
@@ -661,7 +661,7 @@ class Driver:
         self._blind.renew(now)
         self.estimator.renew()
         self._standing.begin(now)
-        self._acknowledged = True
+        self._must_stand = True
 
     def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         self.audience.emit(kind, text, now, **values)

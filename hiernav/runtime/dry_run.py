@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.table import Table
 
 from hiernav.nav.bundle import Bundle
-from hiernav.nav.observation import GUIDES
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.guard import Guard
@@ -83,7 +82,7 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
 def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings) -> dict[str, Any]:
     if bundle is not None:
         require_fit(bundle, robot)
-    needed = [*ESTIMATOR_NEEDS, *(() if bundle is None else (n for n in bundle.layout.names if n not in GUIDES))]
+    needed = [*ESTIMATOR_NEEDS, *(() if bundle is None else bundle.layout.sensors)]
     frames, seconds = _look(robot, needed)
     given: dict[str, list[np.ndarray]] = {}
     for frame in frames:

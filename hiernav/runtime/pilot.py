@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-from hiernav.nav.observation import GUIDES
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
 from hiernav.runtime.estimate import Estimate
@@ -124,7 +123,7 @@ class Pilot:
             max_age: of the state a plan was made from, when it arrives [s].
         """
         self.agent, self.link, self.max_age = agent, link, max_age
-        self._sensed = [name for name in agent.layout.names if name not in GUIDES]
+        self._sensed = list(agent.layout.sensors)
         self._sound = SoundPlanner(agent.option.planner)
         agent.option.planner = self._sound
         self.late = 0
@@ -134,7 +133,7 @@ class Pilot:
     @property
     def sizes(self) -> dict[str, int] | None:
         """How many values each sensor gives that the skill observes, by name."""
-        return {term.name: term.size for term in self.agent.layout.terms if term.name not in GUIDES}
+        return self.agent.layout.sensors
 
     @property
     def control_period(self) -> float:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hiernav.nav.bundle import Bundle
-from hiernav.nav.observation import GUIDES
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import Planner, PlanQuery, kept
 from hiernav.nav.recovery import Recovery
@@ -140,7 +139,7 @@ class Replay:
 
     def _begin(self) -> None:
         """The loop was started: the estimator knows nothing."""
-        sizes = {term.name: term.size for term in self._agent.layout.terms if term.name not in GUIDES}
+        sizes = self._agent.layout.sensors
         self._estimator.skill_terms = sizes
         self._estimator.reset()
         self._terms = TermHold(sizes)

@@ -152,7 +152,7 @@ MUTANTS = (
            f"{T}/test_driver.py"),
     Mutant("robot that moves again", f"{R}/watchdogs.py", "self._since, self._told = now, False\n        if not",
            "self._told = True\n        if not", f"{T}/test_driver.py"),
-    Mutant("goal of a robot that rolls", f"{R}/driver.py", "if self._acknowledged:\n            wait",
+    Mutant("goal of a robot that rolls", f"{R}/driver.py", "if self._must_stand:\n            wait",
            "if False:\n            wait", f"{T}/test_driver.py"),
     Mutant("fault upon a fault", f"{R}/supervisor.py", "kind in self._kinds or", "True or", f"{T}/test_supervisor.py"),
     Mutant("frozen lidar", f"{R}/freshness.py", "way > max(TRAVEL, SPARE", "way > max(math.inf, SPARE",
