@@ -396,7 +396,7 @@ sys.exit(main(["train", "run_dir=run"]))
 @pytest.mark.train
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ctrl_c_and_sigterm_stop_training_with_how_to_go_on_and_going_on_works(tmp_path, capsys, number, code):
-    settings = ("skill.total_steps=7680", "skill.eval_every_steps=7680")
+    settings = ("skill.num_envs=8", "skill.total_steps=7680", "skill.eval_every_steps=7680")
     run = tmp_path / "run"
     train = start("train", "--stage", "skill", *tiny_run.arguments(run, *settings))
     await_file(run / "skill" / "checkpoint.pt", train)
@@ -410,7 +410,7 @@ def test_ctrl_c_and_sigterm_stop_training_with_how_to_go_on_and_going_on_works(t
     assert cli.main(["train", "--stage", "skill", "--resume", str(run)]) == 0
     assert f"run folder: {run}" in capsys.readouterr().out
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines if line["stage"] == "skill"] == list(range(256, 7681, 256))
+    assert [line["step"] for line in lines if line["stage"] == "skill"] == list(range(1280, 7681, 1280))
     assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [7680]
 
 

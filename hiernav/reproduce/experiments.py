@@ -135,7 +135,7 @@ SMOKE = Size(
         *_SMALL, "planner.samples=24", "planner.worlds=['pillar(1.2,1.2,2)']", "threads=1",
         "skill.worlds=['pillar(1.2,1.2,2)']", "skill.num_envs=4", "skill.total_steps=128", "skill.learning_starts=64",
         "skill.updates_per_step=0.1", "skill.batch_size=16", "skill.hidden=[16, 16]", "skill.eval_every_steps=64",
-        "skill.eval_episodes=2", "skill.checkpoint_every_steps=64",
+        "skill.eval_episodes=2", "skill.checkpoint_every_steps=64", "skill.buffer_size=1000",
     ),
     fine_tuning=(*_SMALL, "planner.samples=24"),
     table2_samples=(16, 32),
