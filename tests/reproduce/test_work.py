@@ -232,7 +232,7 @@ def test_the_command_trains_drives_and_films_and_does_not_repeat_itself(tmp_path
     assert not damaged and {result.id for result in results} == set(tally["done"])
     assert {(r.experiment, r.variant) for r in results} >= {
         ("table3", "shipped"), ("table3", "shipped-finetuned"), ("table3", "ours"), ("table3", "finetuned"),
-        ("table3", "baseline"), ("sample_efficiency", "ours"), ("sample_efficiency", "baseline"), 
+        ("table3", "baseline"), ("sample_efficiency", "ours"), ("sample_efficiency", "baseline"),
         ("table2", "default"), ("films", "shipped"), ("planners", "ours"),
     }  # fmt: skip
     film = read_result(tmp_path / "results", "films/point-pillar-1.2-1.2-2")
