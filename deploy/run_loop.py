@@ -547,10 +547,10 @@ def _require_writable(file: Path, option: str) -> None:
 
 def _save(file: Path, values: Any) -> None:
     """Write JSON so that nobody ever sees half of it; where that fails, say so and go on."""
-    from hiernav.run import write_atomically  # not needed before, and the robot need not wait for it
+    from hiernav.files import write_json  # not needed before, and the robot need not wait for it
 
     try:
-        write_atomically(file, json.dumps(values, indent=2).encode() + b"\n")
+        write_json(file, values)
     except OSError as error:
         _warn(file, error)
 

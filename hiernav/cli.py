@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from hiernav.files import write_json
 from hiernav.run import TrainingDiverged, WorkersLost, check_stage
 
 if TYPE_CHECKING:
@@ -381,7 +382,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     else:
         _print_results(results)
         if arguments.json:
-            _write_json(Path(arguments.json), results)
+            write_json(Path(arguments.json), results)
     return 0
 
 
@@ -485,7 +486,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         if not log.complete:
             print("the recording is cut off there: what came later was not written, or is damaged")
     if arguments.json:
-        _write_json(Path(arguments.json), found)
+        write_json(Path(arguments.json), found)
     return 0 if result.equal else FAILED
 
 
@@ -713,13 +714,6 @@ def _print_results(results: dict[str, dict[str, Any]]) -> None:
             else ""
         )
         console.print(f"{name}: plans ended by {replans}{checked}", style="dim", highlight=False)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(json.dumps(value, indent=2) + "\n")
-    partial.replace(path)
 
 
 @contextmanager

@@ -14,7 +14,6 @@ run leaves the same files as an uninterrupted one. Checkpoints, and what they sp
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
+from hiernav.files import sync, write_atomically, write_json
 from hiernav.lock import FolderLock
 
 
@@ -190,7 +190,7 @@ class Run:
                 known = _json_object(file.read_text()) if file.exists() else {}
             except _DAMAGED as error:
                 raise _damaged(file, error) from None
-            write_atomically(file, (json.dumps({**known, **values}, indent=2) + "\n").encode())
+            write_json(file, {**known, **values})
 
     def _append(self, log: str, stage: str, step: int, values: Mapping[str, float], curves: str) -> None:
         known = {key: value if math.isfinite(value) else None for key, value in values.items()}
@@ -340,36 +340,3 @@ def _read_checkpoint(file: Path) -> dict[str, Any]:
         raise RunError(
             f"{file} cannot be read ({type(error).__name__}): restore it, or remove it and train with --resume"
         ) from error
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that readers and crashes see the old or the new one, never half of it.
-
-    Once this has returned it is the new one, after a power failure too.
-    """
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def sync(path: Path) -> None:
-    """Wait until a file's contents, or the names in a folder, are on disk.
-
-    Raises:
-        OSError: the disk cannot take them.
-    """
-    opened = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    except OSError as error:
-        if error.errno != errno.EINVAL or not path.is_dir():  # some file systems know no such thing of folders
-            raise
-    finally:
-        os.close(opened)

@@ -183,7 +183,7 @@ def test_a_disk_without_room_for_the_start_is_one_line_and_leaves_no_run(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("hiernav.run.os.replace", full)
+    monkeypatch.setattr("hiernav.files.os.replace", full)
     assert cli.main(command(able_run, tmp_path / "tuned")) == 2
     told = capsys.readouterr().err
     assert f"{tmp_path / 'tuned'} cannot be written to (No space left on device): there is no run yet" in told

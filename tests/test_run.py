@@ -14,7 +14,7 @@ from locked import other_process
 from hiernav import lock as lock_module
 from hiernav import run as run_module
 from hiernav.config import ConfigError, load_config
-from hiernav.run import Run, RunError, newest_run, spent_seconds, write_atomically
+from hiernav.run import Run, RunError, newest_run, spent_seconds
 
 
 @pytest.fixture
@@ -66,25 +66,6 @@ def test_a_run_whose_configuration_is_broken_is_named(run):
 def test_a_run_from_before_a_setting_was_refused_can_still_be_opened(run):
     (run.path / "config.yaml").write_text("planner: {preset: paper, hypotheses: 6}\n")
     assert Run.open(run.path).config.planner.hypotheses == 6
-
-
-def test_a_file_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
-    file = tmp_path / "checkpoint.pt"
-    write_atomically(file, b"old")
-    synced: list[bytes] = []
-
-    def fail(source, target):
-        synced.append(Path(source).read_bytes())
-        raise OSError("power cut")
-
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="power cut"):
-        patch.setattr(run_module.os, "replace", fail)
-        write_atomically(file, b"new and longer")
-    assert file.read_bytes() == b"old" and os.listdir(tmp_path) == ["checkpoint.pt"]
-    assert synced == [b"new and longer"]  # complete, on disk, before it takes the old one's place
-    write_atomically(file, b"newest")
-    assert file.read_bytes() == b"newest"
-    assert os.listdir(tmp_path) == ["checkpoint.pt"]
 
 
 def test_summaries_of_the_stages_are_merged(run):

@@ -15,7 +15,6 @@ All but --peers and --loop by default. Close other programs first: ratios surviv
 from __future__ import annotations
 
 import argparse
-import json
 import platform
 import sys
 from collections.abc import Callable
@@ -29,6 +28,8 @@ from bench_env import bench_env
 from bench_loop import bench_loop
 from bench_plan import bench_learn, bench_plan
 from bench_updates import bench_peers, bench_update
+
+from hiernav.files import write_json
 
 PARTS = ("env", "update", "peers", "tick", "loop", "plan", "learn")
 ON_REQUEST = ("peers", "loop")
@@ -51,7 +52,7 @@ def main() -> int:
     for name in parts or [name for name in PARTS if name not in ON_REQUEST]:
         results[name] = BENCHES[name](arguments)
     if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+        write_json(arguments.json, results)
     return 0
 
 

@@ -26,6 +26,8 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 from bad_input import exit_code, number_from, whole  # noqa: E402
 
+from hiernav.files import write_json  # noqa: E402
+
 WORLD = "pillar(4,4,40)"
 RUNS = ((50, 60.0, 0), (100, 60.0, 0), (50, 60.0, 2), (500, 10.0, 0))
 """Rate [Hz], time [s] and number of hogs of each run."""
@@ -50,7 +52,7 @@ def main() -> int:
         found = [measure(arguments.rate, *settings)]
         show(found[0])
     if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+        write_json(arguments.json, found)
     return 0
 
 

@@ -36,6 +36,7 @@ sys.path.insert(0, str(ROOT))
 
 from bad_input import exit_code, whole  # noqa: E402
 
+from hiernav.files import write_json  # noqa: E402
 from hiernav.nav.bundle import Bundle, load_bundle  # noqa: E402
 from hiernav.nav.goal import GOAL_RADIUS  # noqa: E402
 from hiernav.runtime.clock import FakeClock  # noqa: E402
@@ -271,12 +272,9 @@ def _read(path: Path, about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write(path: Path, results: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     for entry in results["cases"].values():
         entry["summary"] = _summary(entry["worlds"])
-    partial = path.with_suffix(".part")
-    partial.write_text(json.dumps(results, indent=1) + "\n")
-    partial.replace(path)
+    write_json(path, results)
 
 
 def _summary(worlds: dict[str, dict[str, Any]]) -> dict[str, Any]:

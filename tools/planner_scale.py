@@ -13,7 +13,6 @@ the robot, one thread. Each planner in two cases:
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -25,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from bad_input import exit_code, positive, whole
 
+from hiernav.files import write_json
 from hiernav.nav.bundle import load_bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
@@ -72,8 +72,7 @@ def main() -> int:
             cells = (f"{row[name]['median_ms']:10.2f} {row[name]['max_ms']:9.2f}" for name in COLORS)
             print(f"{half:7g} m {case:>9} " + " ".join(f"{cell:>20}" for cell in cells), flush=True)
     if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+        write_json(arguments.json, rows)
     if arguments.png:
         _plot(rows, arguments.png)
         print(f"wrote {arguments.png}")

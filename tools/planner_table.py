@@ -25,6 +25,7 @@ from bad_input import exit_code, whole
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from hiernav.files import write_json
 from hiernav.report.paper import TABLE2
 
 
@@ -58,7 +59,7 @@ def main() -> int:
             began = time.perf_counter()
             print(f"[{number + 1} of {len(missing)}] {_name(*job)}", flush=True)
             results[_name(*job)] = _run(arguments, *job)
-            _write(arguments.out / "table.json", results)
+            write_json(arguments.out / "table.json", results)
             print(f"    {_line(results[_name(*job)])}  {time.perf_counter() - began:.0f} s", flush=True)
     _print(results)
     return 0
@@ -141,13 +142,6 @@ def _require_same(arguments: argparse.Namespace, results: dict[str, Any]) -> Non
         if different := [key for key, value in wanted.items() if result.get(key) != value]:
             there = ", ".join(f"{key} {result.get(key)}" for key in different)
             raise ValueError(f"{arguments.out / 'table.json'}: {name} is of {there}; choose another --out")
-
-
-def _write(file: Path, results: dict[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(file.name + ".part")
-    partial.write_text(json.dumps(results, indent=2) + "\n")
-    partial.replace(file)
 
 
 if __name__ == "__main__":

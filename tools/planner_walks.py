@@ -10,7 +10,6 @@ bundle's planning radius. With repair no waypoint may touch anything: the exit c
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -19,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from bad_input import exit_code, whole
 
 from hiernav.evaluate import evaluate_plans, open_policies
+from hiernav.files import write_json
 from hiernav.reproduce.experiments import WORLDS
 from hiernav.reproduce.work import WALKERS
 from hiernav.sim.factory import expert_planner
@@ -54,8 +54,7 @@ def main() -> int:
                 flush=True,
             )
     if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+        write_json(arguments.json, rows)
     if touched:
         print(f"{touched} waypoints of verified plans touch an obstacle", file=sys.stderr)
     return 1 if touched else 0

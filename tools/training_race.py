@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from bad_input import exit_code, share, whole
 
 from hiernav.config import load_config
+from hiernav.files import write_json
 
 CONTENDERS = {"hiernav": "#2b6cb0", "float32": "#2f855a", "torchrl": "#dd6b20"}
 EPISODES = 200
@@ -59,8 +60,7 @@ def main() -> int:
         rate = laps[-1]["updates"] / laps[-1]["seconds"]
         print(f"{name:8s} {end}{'' if there else ': not there'}; {rate:.0f} updates/s beside the simulations")
     if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(races, indent=1) + "\n")
+        write_json(arguments.json, races)
     if arguments.png:
         _plot(races, arguments.reach, arguments.png)
         print(f"wrote {arguments.png}")

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from hiernav.files import write_atomically
 from hiernav.nav.observation import ObservationLayout, ObservationTerm
 from hiernav.nav.onnx_file import OnnxFacts, OnnxFileError, inspect_onnx
 
@@ -234,9 +235,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> Manifest:
     manifest = msgspec.structs.replace(manifest, files=files, opset=opsets[SKILL])
     encoded = msgspec.json.format(msgspec.json.encode(manifest), indent=2)
     _decode_manifest(encoded)
-    partial = folder / (MANIFEST + ".part")
-    partial.write_bytes(encoded + b"\n")
-    partial.replace(folder / MANIFEST)
+    write_atomically(folder / MANIFEST, encoded + b"\n")
     return manifest
 
 

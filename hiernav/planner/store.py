@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from hiernav.files import write_atomically
 from hiernav.lock import LOCK, FolderLock
 from hiernav.planner.dataset import LabelSettings, Samples, label_worlds, map_tasks
 
@@ -206,7 +206,7 @@ def _make_shard(
             with archive.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array(member, getattr(samples, name)[:count], allow_pickle=False)
     file = f"shard-{number:05d}.npz"
-    _write(folder / file, buffer.getvalue())
+    write_atomically(folder / file, buffer.getvalue())
     return Shard(file, count, hashlib.sha256(buffer.getbuffer()).hexdigest())
 
 
@@ -238,10 +238,4 @@ def _read_shard(file: Path, shard: Shard, settings: LabelSettings) -> Samples:
 
 
 def _write_manifest(folder: Path, manifest: Manifest) -> None:
-    _write(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
-
-
-def _write(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    write_atomically(folder / MANIFEST, msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import cv2
 
+from hiernav.files import write_atomically
 from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls
 from hiernav.reproduce.experiments import ABLATED, DEPARTURE_WORLDS, EXPERIMENTS, OF_LEGS, ROBOTS, TABLE3_ROBOT, WORLDS
 from hiernav.reproduce.results import Result
-from hiernav.run import write_atomically
 
 FILM_LIMIT = 120_000
 """Bytes of a film that is put into the page; a larger one is linked to."""

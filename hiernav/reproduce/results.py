@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from hiernav import __version__
-from hiernav.run import write_atomically
+from hiernav.files import write_atomically
 
 Code = tuple[str | None, bool | None]
 """What a process runs: the commit, and whether it is other code than that; None and None where there is no git."""

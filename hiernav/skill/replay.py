@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from hiernav.files import sync
 from hiernav.nav.mirror import Mirror
-from hiernav.run import sync
 
 KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated"))
 
