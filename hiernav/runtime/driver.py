@@ -97,7 +97,41 @@ class _Seen:
     occupancy: OccupancyMap | None = None
     decision: Decision | None = None
     sent: np.ndarray | None = None
+    plan_speed: float = 1.0
+    """What the plan's age allows of the speed."""
     scale: float = 1.0
+    """What was left of the command's size."""
+
+
+@dataclass
+class _Run:
+    """One call of `run` or `serve`: its watches, and what the next tick must know of the last ones."""
+
+    first_tick: int
+    """Of the loop, whose ticks are counted over all runs."""
+    terms: TermHold
+    blind: BlindWatch
+    overruns: OverrunWatch
+    plans: PlanWatch
+    no_way: BlockedWatch
+    saturation: SaturationWatch
+    standing: StopWatch
+    must_stand: bool
+    """Whether the robot must be seen to stand before any goal is driven to."""
+    driven: bool = False
+    """Whether any action was sent."""
+    saturated: int = 0
+    """Recoveries from a saturated action on the way to the present goal."""
+    frame: SensorFrame | None = None
+    """The newest."""
+    occupancy: OccupancyMap | None = None
+    """The newest."""
+    restarts: int | None = None
+    """Of the estimator, that are known of."""
+    unshown: _Seen | None = None
+    """The present tick, until it was shown."""
+    told: tuple[str, str | None] = ("", None)
+    """The failure that was logged last, and the fault that it led to."""
 
 
 class Driver:
@@ -162,10 +196,10 @@ class Driver:
         self._ended: Trip | None = None
         self._last_trip: Trip | None = None
         self._estimate: Estimate | None = None
-        self._restarts: int | None = None
         self._paused = self._serving = False
         self._stop_wanted: str | None = None
         self._held_since = 0.0
+        self._run = self._new_run()
 
     def _require_fit(self) -> None:
         trained, period = self.pilot.control_period, self.robot.control_period
@@ -282,28 +316,28 @@ class Driver:
             self._drop_oldest("the loop had not begun")
         self._trip, self._ended, self._last_trip, self._paused = None, None, None, False
         self.gone = None
-        self._told: tuple[str, str | None] = ("", None)
-        self._estimate, self._restarts = None, None
-        self._last_frame: SensorFrame | None = None
-        self._unshown: _Seen | None = None
-        self._occupancy: OccupancyMap | None = None
-        self._loop_ticks = self.loop.ticks
-        self._terms = TermHold(self.pilot.sizes)
+        self._estimate = None
+        self._run = self._new_run()
+        if self._run.must_stand:
+            self._run.standing.begin(now)
         self.estimator.skill_terms, self.estimator.driven = self.pilot.sizes, False
-        config, trust = self.config, self.estimator.config
-        self._blind = BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate)
-        self._overruns = OverrunWatch()
-        self._plans = PlanWatch(config.plan_slow, config.plan_hold)
-        self._no_way = BlockedWatch(0.0, config.no_way_at_start)
-        self._saturation = SaturationWatch(self.robot.action_dim, self.robot.control_period)
-        self._standing = StopWatch(config.stop_speed, config.stop_turn, config.stop_timeout)
-        self._must_stand = not self.stopped  # before any goal is driven to
-        if self._must_stand:
-            self._standing.begin(now)
-        self._driven = False
         self.estimator.reset()
         self.last_result = None
         _warm_up(self.estimator.config)
+
+    def _new_run(self) -> _Run:
+        config, trust = self.config, self.estimator.config
+        return _Run(
+            first_tick=self.loop.ticks,
+            terms=TermHold(self.pilot.sizes),
+            blind=BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate),
+            overruns=OverrunWatch(),
+            plans=PlanWatch(config.plan_slow, config.plan_hold),
+            no_way=BlockedWatch(0.0, config.no_way_at_start),
+            saturation=SaturationWatch(self.robot.action_dim, self.robot.control_period),
+            standing=StopWatch(config.stop_speed, config.stop_turn, config.stop_timeout),
+            must_stand=not self.stopped,
+        )
 
     def _loop(self) -> None:
         """Tick until done, brake, save what was observed, and make sure that the robot stands."""
@@ -329,7 +363,7 @@ class Driver:
         The first time a tick in which a plan ends, which has the memory at hand; `again` what most ticks are, which has
         the processor foresee the branches as well.
         """
-        trip, frame, estimate, occupancy = self._trip, self._last_frame, self._estimate, self._occupancy
+        trip, frame, estimate, occupancy = self._trip, self._run.frame, self._estimate, self._run.occupancy
         if trip is None or frame is None or estimate is None or occupancy is None:
             return
         try:
@@ -351,7 +385,7 @@ class Driver:
         except Exception as error:
             self._take_failure(error, now)
             self.estimator.driven = False
-            self._standing.postpone(now)  # what cannot be read cannot be seen to stand
+            self._run.standing.postpone(now)  # what cannot be read cannot be seen to stand
             self.robot.brake()
             self._show(now)  # what the estimator has taken must not be missing in a recording
         return self.gone is not None or (not self._serving and self._trip is None)
@@ -360,38 +394,38 @@ class Driver:
         """A fault, told of once as long as it is not acknowledged: a robot may fail alike at every tick."""
         why = f"{type(error).__name__}: {error}"
         kind = re.sub(r"[0-9]+", "", why)
-        if (kind, self.supervisor.fault) != self._told:
+        if (kind, self.supervisor.fault) != self._run.told:
             log.exception("control step failed")
         self._fail(why, now)
-        self._told = kind, self.supervisor.fault
+        self._run.told = kind, self.supervisor.fault
         if isinstance(error, RobotGone):
             self.gone = why
 
     def _step(self, now: float) -> None:
         timer, supervisor = self.timer, self.supervisor
-        self._unshown = None
+        self._run.unshown = None
         timer.begin()
         try:
-            frame = self._last_frame = self.robot.read()
+            frame = self._run.frame = self.robot.read()
             truth = self._truth() if self._truth is not None and self.audience else None
             timer.mark("read")
             self._estimate = estimate = self.estimator.update(frame)
-            self._unshown = seen = _Seen(frame, truth, estimate)
-            terms = self._terms.fill(frame)
+            self._run.unshown = seen = _Seen(frame, truth, estimate)
+            terms = self._run.terms.fill(frame)
             timer.mark("estimate")
         except Exception:
             self._take_requests(now)  # a robot that cannot be read can be stopped, and its fault acknowledged
             raise
         self._take_requests(now)
-        trust, doubt = self._blind.check(estimate, now, self.estimator.lacks)
-        wait = self._overruns.check(self.loop.overruns_in_a_row)
+        trust, doubt = self._run.blind.check(estimate, now, self.estimator.lacks)
+        wait = self._run.overruns.check(self.loop.overruns_in_a_row)
         stamp = frame.stamp if estimate is None else estimate.stamp
         if self._trip is not None:
             self._trip.last = stamp
         if trust is Trust.LOST and self._trip is not None:
             self._fail(doubt, now)
         if estimate is not None and trust is Trust.GOOD and not supervisor.latched:
-            seen.occupancy = occupancy = self._occupancy = self._map_at(stamp)
+            seen.occupancy = occupancy = self._run.occupancy = self._map_at(stamp)
             self._get_ready(estimate, occupancy, now)
             if self._trip is not None and not self._is_over(self._trip, estimate, occupancy, now):
                 lacks = self.pilot.lacks(terms)
@@ -401,10 +435,10 @@ class Driver:
         elif supervisor.mode in (Mode.READY, Mode.ARMED):
             supervisor.change(Mode.INIT, doubt, now)
         if self._trip is not None and not supervisor.latched:
-            self._choose_mode(self._trip, seen.decision, doubt if trust is Trust.HOLD else wait, stamp, now)
+            self._choose_mode(self._trip, seen, doubt if trust is Trust.HOLD else wait, stamp, now)
         guarded = False
         if supervisor.driving and seen.decision is not None and estimate is not None and seen.occupancy is not None:
-            seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, now)
+            seen.sent, seen.scale = self._send(seen.decision, estimate, seen.occupancy, seen.plan_speed, now)
             guarded = True
         self.estimator.driven = seen.sent is not None
         if seen.sent is None:
@@ -420,7 +454,7 @@ class Driver:
 
     def _map_at(self, stamp: float) -> OccupancyMap:
         """The known map; where one is published again unchanged, the one that is known already."""
-        occupancy, before = self.occupancy(stamp), self._occupancy
+        occupancy, before = self.occupancy(stamp), self._run.occupancy
         if before is None or before is occupancy or not occupancy.shows_the_same_as(before):
             return occupancy
         return before
@@ -445,8 +479,8 @@ class Driver:
         supervisor, trip = self.supervisor, self._trip
         if supervisor.mode is Mode.INIT:
             supervisor.change(Mode.READY, "position and heading known", now)
-            if self._restarts is None:
-                self._restarts = estimate.restarts
+            if self._run.restarts is None:
+                self._run.restarts = estimate.restarts
         if supervisor.mode is Mode.READY and trip is not None and not self._paused:
             try:
                 config = self.config
@@ -458,8 +492,8 @@ class Driver:
                 return
             supervisor.change(Mode.ARMED, f"goal {trip.goal[0]:g}, {trip.goal[1]:g}", now)
             self._held_since = now
-        if estimate.restarts != self._restarts:
-            self._restarts = estimate.restarts
+        if estimate.restarts != self._run.restarts:
+            self._run.restarts = estimate.restarts
             self._emit("plan", "the position was found anew: the plan is void", now)
             self.pilot.drop()
 
@@ -489,21 +523,20 @@ class Driver:
             self.timer.mark("infer")
         return decision
 
-    def _choose_mode(self, trip: Trip, decision: Decision | None, wait: str | None, stamp: float, now: float) -> None:
+    def _choose_mode(self, trip: Trip, seen: _Seen, wait: str | None, stamp: float, now: float) -> None:
         """What the robot may do in this tick, `wait` being why it must not move, if so."""
-        supervisor = self.supervisor
-        if self._must_stand:
+        supervisor, decision = self.supervisor, seen.decision
+        if self._run.must_stand:
             wait = "the robot has not been seen to stand since the fault"
         if self._paused:
             wait, self._held_since = "paused", now
-        self._plan_speed = 1.0
         if decision is not None:
             failed = self.pilot.failed
             if failed is not None:
                 self._fail(failed, now)
                 return
-            self._plan_speed, overdue = self._plans.check(decision.overdue)
-            no_way, give_up = self._no_way.check(decision.refused, now)
+            seen.plan_speed, overdue = self._run.plans.check(decision.overdue)
+            no_way, give_up = self._run.no_way.check(decision.refused, now)
             wait = wait or overdue or no_way or (None if decision.has_plan else "no plan yet")
             if give_up:
                 self._end_trip("unreachable", now, "the planner finds no way to the goal")
@@ -515,7 +548,7 @@ class Driver:
             if supervisor.mode is Mode.ARMED and decision is not None and wait is None:
                 supervisor.change(Mode.RUNNING, "first plan", now)
                 trip.began = stamp
-                self._no_way = BlockedWatch(self.config.no_way_hold, self.config.no_way)
+                self._run.no_way = BlockedWatch(self.config.no_way_hold, self.config.no_way)
             elif supervisor.mode is Mode.ARMED and now - self._held_since > self.config.hold_timeout:
                 self._fail(f"armed for {self.config.hold_timeout:g} s: {wait}", now)
             return
@@ -529,7 +562,7 @@ class Driver:
             self.supervisor.change(Mode.HOLD, why, now)
             trip.holds[re.sub(r" (for )?[0-9].*", "", why)] += 1
             self._held_since = now
-            self._standing.begin(now)
+            self._run.standing.begin(now)
         elif now - self._held_since > self.config.hold_timeout:
             self._fail(f"held for {self.config.hold_timeout:g} s: {why}", now)
 
@@ -537,7 +570,7 @@ class Driver:
         supervisor = self.supervisor
         if supervisor.mode is Mode.HOLD:
             supervisor.change(Mode.RUNNING, "nothing to wait for any more", now)
-            self._saturation.reset()
+            self._run.saturation.reset()
         if decision.recovering and supervisor.mode is Mode.RUNNING:
             if trip.recoveries >= self.config.max_recoveries:
                 self._fail(f"stuck: {trip.recoveries} recoveries on the way to this goal", now)
@@ -547,10 +580,10 @@ class Driver:
         elif not decision.recovering and supervisor.mode is Mode.RECOVERING:
             supervisor.change(Mode.RUNNING, "recovery done", now)
             self.pilot.replan()
-            self._saturation.reset()
+            self._run.saturation.reset()
 
     def _send(
-        self, decision: Decision, estimate: Estimate, occupancy: OccupancyMap, now: float
+        self, decision: Decision, estimate: Estimate, occupancy: OccupancyMap, plan_speed: float, now: float
     ) -> tuple[np.ndarray | None, float]:
         """Past the guard to the robot; what was sent, None if the robot is to be braked, and how it was slowed."""
         x, y, _ = estimate.pose.tolist()
@@ -560,21 +593,21 @@ class Driver:
         if slow is not None:
             ttc = time_to_collision(occupancy, (x, y), (vx, vy), self.config.robot_radius, slow)
         moving = estimate.body_velocity()
-        guarded = self.guard.check(decision.action, estimate.upright, ttc, self._plan_speed, moving)
+        guarded = self.guard.check(decision.action, estimate.upright, ttc, plan_speed, moving)
         self.timer.mark("guard")
         if guarded.fault is not None:
             self._fail(guarded.fault, now)
         if guarded.brake or guarded.fault is not None:
             return None, guarded.scale
-        if self.supervisor.mode is Mode.RUNNING and self._saturation.check(decision.action):
-            self._saturation.reset()
-            self._saturated += 1
-            if self._saturated > MAX_SATURATED:
+        if self.supervisor.mode is Mode.RUNNING and self._run.saturation.check(decision.action):
+            self._run.saturation.reset()
+            self._run.saturated += 1
+            if self._run.saturated > MAX_SATURATED:
                 self._fail(f"the action stays saturated, {MAX_SATURATED} recoveries did not help", now)
                 return None, guarded.scale
             self.pilot.recover()
         sent = self.robot.send(guarded.action)
-        self._driven = True
+        self._run.driven = True
         self.timer.mark("send")
         if self._trip is not None:
             self._trip.steps += 1
@@ -592,15 +625,15 @@ class Driver:
         if self._ended is not None:
             self.last_result = self._result(self._ended, stopped=False)
         self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
-        self._blind.renew(now)
-        self._before = (self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts())
-        self._no_way = BlockedWatch(0.0, self.config.no_way_at_start)
+        self._run.blind.renew(now)
+        before = self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts()
+        self._run.no_way = BlockedWatch(0.0, self.config.no_way_at_start)
         self.guard.reset()
         self.pilot.reset()
-        self._saturation.reset()
-        self._saturated = 0
+        self._run.saturation.reset()
+        self._run.saturated = 0
         # last, and in `_end_trip` after the mode: a signal that comes between must not leave half of it
-        self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps), None
+        self._trip, self._ended = Trip(goal, max_steps or self.config.max_steps, before), None
         if ticket is not None:
             ticket.trip = self._trip
 
@@ -608,8 +641,8 @@ class Driver:
         trip, supervisor = self._trip, self.supervisor
         if trip is None:  # the robot was braked before
             return
-        if supervisor.driving or self._standing.stands:  # else it is being looked at already
-            self._standing.begin(now)
+        if supervisor.driving or self._run.standing.stands:  # else it is being looked at already
+            self._run.standing.begin(now)
         trip.reason, trip.detail = reason, detail
         if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
             supervisor.change(Mode.READY, reason, now)
@@ -619,14 +652,14 @@ class Driver:
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:
         """Follow a robot that was braked until it stands; one that does not stop is a fault."""
-        if estimate is None and not self._driven:
-            self._standing.postpone(now)  # it has not been driven, and nothing of it is known yet
-        stands = self._standing.check(estimate, now, *self._measured())
+        if estimate is None and not self._run.driven:
+            self._run.standing.postpone(now)  # it has not been driven, and nothing of it is known yet
+        stands = self._run.standing.check(estimate, now, *self._measured())
         if stands is None:
             return
         self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
         if stands:
-            self._must_stand = False
+            self._run.must_stand = False
         else:
             self._does_not_stop(now)
         if self._ended is not None and self._serving:
@@ -649,7 +682,7 @@ class Driver:
 
     def _estop(self, why: str, now: float) -> None:
         self.supervisor.stop(why, now)
-        self._standing.begin(now)
+        self._run.standing.begin(now)
         self._end_trip("estop", now, why)
 
     def _acknowledge(self, now: float) -> None:
@@ -658,17 +691,17 @@ class Driver:
         self.supervisor.acknowledge(now)
         self.guard.reset()
         self.pilot.renew()
-        self._blind.renew(now)
+        self._run.blind.renew(now)
         self.estimator.renew()
-        self._standing.begin(now)
-        self._must_stand = True
+        self._run.standing.begin(now)
+        self._run.must_stand = True
 
     def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         self.audience.emit(kind, text, now, **values)
 
     def _show(self, now: float) -> None:
         """Tell of a tick, as far as it came, unless that was done."""
-        seen, self._unshown = self._unshown, None
+        seen, self._run.unshown = self._run.unshown, None
         if seen is None or not self.audience:
             return
         decision, estimate = seen.decision, seen.estimate
@@ -688,7 +721,7 @@ class Driver:
                 "proposed": decision.action,
             }
         record = TickRecord(
-            index=self.loop.ticks - self._loop_ticks - 1,
+            index=self.loop.ticks - self._run.first_tick - 1,
             time=now,
             lateness=self.loop.late,
             mode=self.supervisor.mode,
@@ -709,7 +742,7 @@ class Driver:
         return Counter({"rejected": pilot.rejected, "late": pilot.late, "restarts": pilot.restarts} | pilot.plan_counts)
 
     def _result(self, trip: Trip, stopped: bool) -> RunResult:
-        guard, estimator, planner = self._before
+        guard, estimator, planner = trip.before
         return RunResult(
             reason=trip.reason or "interrupted",
             steps=trip.steps,

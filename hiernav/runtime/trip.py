@@ -16,6 +16,8 @@ class Trip:
     goal: np.ndarray
     """(2,) world frame [m]."""
     max_steps: int
+    before: tuple[Counter[str], Counter[str], Counter[str]]
+    """What guard, estimator and planner had counted when it began."""
     steps: int = 0
     """Control steps driven."""
     began: float | None = None
