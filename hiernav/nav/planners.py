@@ -24,7 +24,7 @@ Network = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 scores (M, H) of H hypotheses."""
 
 _FARTHEST = 100.0
-_DIP = 0.15 * CELL
+_FALL_BETWEEN_CELLS = 0.15 * CELL
 """What a shortest path may lack of its radius [m]: the disc is known to fit at the centres of cells, and between two of
 them the clearance may be lower."""
 _TIGHTNESS = 4.0
@@ -219,7 +219,7 @@ class VerifiedPlanner:
         fits = np.isfinite(repaired).all(axis=(1, 2))
         for row in np.flatnonzero(fits).tolist():
             points = places(polyline(query.position[row][None], repaired[row][None]))[0]
-            fits[row] = keeps_room(query.occupancy[row].clearance_at(points), radius, _DIP)[0]
+            fits[row] = keeps_room(query.occupancy[row].clearance_at(points), radius, _FALL_BETWEEN_CELLS)[0]
         return fits
 
     def _leads_away(self, query: PlanQuery, plan: np.ndarray, row: int) -> bool:

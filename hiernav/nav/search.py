@@ -24,7 +24,7 @@ _SAMPLE = 0.05  # [m], at which straight lines are checked against the map
 STANDING = 0.1  # [m], by which a robot may miss the end of its path, strayed or stopped short
 GOAL_REACH = GOAL_RADIUS - STANDING  # [m], from the goal to the end of a path
 LEAD = 4.0 * CELL  # [m], beyond its radius, as far as a robot is led to where its way begins
-_DIP = 0.005  # [m], fall of the clearance along a lead that is put down to the pixels of the map
+_FALL_OF_PIXELS = 0.005  # [m], fall of the clearance along a lead that is put down to the pixels of the map
 _LOOK_AHEAD = np.array([1, 2, 3, 4, 6, 8, 10, 12, 15, 18, 24])  # vertices tried as the end of a straight line
 
 
@@ -189,7 +189,7 @@ class PathField:
         t = np.linspace(0.0, 1.0, 2 + int(np.linalg.norm(delta) / 0.01)) if np.isfinite(delta).all() else np.ones(1)
         points = self.goal + t[:, None] * delta
         clearance = self.occupancy.clearance_at(points)
-        short = np.flatnonzero(clearance < self.radius - (_DIP if clearance[0] >= self.radius else 0.0))
+        short = np.flatnonzero(clearance < self.radius - (_FALL_OF_PIXELS if clearance[0] >= self.radius else 0.0))
         return points[min(short[-1] + 1, len(points) - 1)] if len(short) else self.goal
 
     def _given_room(self, points: np.ndarray) -> np.ndarray:
@@ -249,7 +249,7 @@ class PathField:
         """Whether the disc can move straight from a start (2,), where it need not fit, to ends (M, 2): (M,) bool."""
         t = np.linspace(0.0, 1.0, 2 + int(2.0 * (self.radius + LEAD) / _SAMPLE))[:, None]
         clearance = self.occupancy.clearance_at((1.0 - t) * start + t * ends[:, None])
-        return keeps_room(clearance, self.radius, _DIP)
+        return keeps_room(clearance, self.radius, _FALL_OF_PIXELS)
 
 
 def goal_reach_for(goal_radius: float) -> float:

@@ -13,6 +13,15 @@ CAPACITY = 16384
 """Bytes that a frame may take."""
 
 
+class _Truth(msgspec.Struct, array_like=True):
+    time: float
+    pose: list[float]
+    velocity: list[float]
+    upright: float
+    collided: bool
+    collisions: int
+
+
 class _Frame(msgspec.Struct, array_like=True):
     stamp: float
     accelerometer: list[float] | None
@@ -24,7 +33,7 @@ class _Frame(msgspec.Struct, array_like=True):
     position_fix: list[float] | None
     fix_stamp: float | None
     rotation: list[float] | None
-    truth: tuple[float, list[float], list[float], float, bool, int] | None
+    truth: _Truth | None
 
 
 _GIVEN = struct.Struct("<d")
@@ -36,25 +45,25 @@ def encode_frame(frame: SensorFrame, truth: Truth | None) -> bytes:
     """A frame, and the truth of a simulated robot."""
     return _encoder.encode(
         _Frame(
-            float(frame.stamp),
-            _list(frame.accelerometer),
-            _list(frame.gyro),
-            _list(frame.magnetometer),
-            _list(frame.velocimeter),
-            _list(frame.lidar),
-            {name: np.asarray(value, np.float64).ravel().tolist() for name, value in frame.extra.items()},
-            _list(frame.position_fix),
-            None if frame.fix_stamp is None else float(frame.fix_stamp),
-            _list(frame.rotation),
-            None
+            stamp=float(frame.stamp),
+            accelerometer=_list(frame.accelerometer),
+            gyro=_list(frame.gyro),
+            magnetometer=_list(frame.magnetometer),
+            velocimeter=_list(frame.velocimeter),
+            lidar=_list(frame.lidar),
+            extra={name: np.asarray(value, np.float64).ravel().tolist() for name, value in frame.extra.items()},
+            position_fix=_list(frame.position_fix),
+            fix_stamp=None if frame.fix_stamp is None else float(frame.fix_stamp),
+            rotation=_list(frame.rotation),
+            truth=None
             if truth is None
-            else (
-                truth.time,
-                truth.pose.tolist(),
-                truth.velocity.tolist(),
-                truth.upright,
-                truth.collided,
-                truth.collisions,
+            else _Truth(
+                time=truth.time,
+                pose=truth.pose.tolist(),
+                velocity=truth.velocity.tolist(),
+                upright=truth.upright,
+                collided=truth.collided,
+                collisions=truth.collisions,
             ),
         )
     )
@@ -66,23 +75,30 @@ def decode_frame(message: bytes) -> tuple[SensorFrame, Truth | None]:
     Raises:
         msgspec.DecodeError: other bytes.
     """
-    m = _decoder.decode(message)
+    read = _decoder.decode(message)
     frame = SensorFrame(
-        m.stamp,
-        _array(m.accelerometer),
-        _array(m.gyro),
-        _array(m.magnetometer),
-        _array(m.velocimeter),
-        _array(m.lidar),
-        {name: np.array(value) for name, value in m.extra.items()},
-        _array(m.position_fix),
-        m.fix_stamp,
-        _array(m.rotation),
+        stamp=read.stamp,
+        accelerometer=_array(read.accelerometer),
+        gyro=_array(read.gyro),
+        magnetometer=_array(read.magnetometer),
+        velocimeter=_array(read.velocimeter),
+        lidar=_array(read.lidar),
+        extra={name: np.array(value) for name, value in read.extra.items()},
+        position_fix=_array(read.position_fix),
+        fix_stamp=read.fix_stamp,
+        rotation=_array(read.rotation),
     )
-    if m.truth is None:
+    true = read.truth
+    if true is None:
         return frame, None
-    time, pose, velocity, upright, collided, collisions = m.truth
-    return frame, Truth(time, np.array(pose), np.array(velocity), upright, collided, collisions)
+    return frame, Truth(
+        time=true.time,
+        pose=np.array(true.pose),
+        velocity=np.array(true.velocity),
+        upright=true.upright,
+        collided=true.collided,
+        collisions=true.collisions,
+    )
 
 
 def encode_command(action: np.ndarray | None, given: float) -> bytes:
