@@ -48,6 +48,7 @@ class ObservationLayout:
 
     @property
     def slices(self) -> dict[str, slice]:
+        """Columns of each term, by name."""
         ends = np.cumsum([0] + [term.size for term in self.terms])
         return {t.name: slice(int(a), int(b)) for t, a, b in zip(self.terms, ends[:-1], ends[1:], strict=True)}
 

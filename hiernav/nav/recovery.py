@@ -179,7 +179,7 @@ class Recovery:
 
     def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
         first = int(self._tries[row]) * self.ways  # go on where the last recovery in this place ended
-        self._bearings[row] = np.roll(_ranked_ways(pose, plan, occupancy, self.radius)[0], -first)
+        self._bearings[row] = np.roll(ways_out(pose, plan, occupancy, self.radius)[0], -first)
         self._spacing[row], self._ways_left[row] = _spacing(pose, plan), self.ways
         self._turn(row, pose[:2], len(plan), occupancy)
         self._began[row], self._trail[row] = pose[:2], np.nan
@@ -225,7 +225,9 @@ _AHEAD_FIRST = np.pi / 4 * np.array([0, 4, 2, -2, 1, -1, 3, -3])
 _BACK_FIRST = np.pi / 4 * np.array([4, 0, 2, -2, 3, -3, 1, -1])
 
 
-def ways_out(pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius: float) -> list[np.ndarray]:
+def ways_out(
+    pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Straight plans away from a robot, each up to the first waypoint that is not free to come to and padded there.
 
     Args:
@@ -235,16 +237,10 @@ def ways_out(pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius
         radius: of the disc that is swept along them [m].
 
     Returns:
-        Eight ways (K, 2), world frame [m], in the order to try them: ahead or back, whichever is nearer to the plan;
-        the opposite; the sides and then the diagonals, the plan's first. Those that are blocked at once come last.
+        Bearings (8,) in the world frame [rad] and ways (8, K, 2), world frame [m], in the order to try them: ahead or
+        back, whichever is nearer to the plan; the opposite; the sides and then the diagonals, the plan's first. Those
+        that are blocked at once come last.
     """
-    return list(_ranked_ways(pose, plan, occupancy, radius)[1])
-
-
-def _ranked_ways(
-    pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap, radius: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """`ways_out` as bearings (8,) in the world frame [rad] and ways (8, K, 2) [m]."""
     middle = plan[len(plan) // 2] - pose[:2]
     bearing = np.arctan2(middle[1], middle[0]) - pose[2]
     turns = _BACK_FIRST if np.cos(bearing) < 0.0 else _AHEAD_FIRST

@@ -58,13 +58,11 @@ class FakeClock:
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = float(start)
-        self.sleeps: int = 0
 
     def now(self) -> float:
         return self._now
 
     def sleep_until(self, deadline: float) -> None:
-        self.sleeps += 1
         self._now = max(self._now, float(deadline))
 
     def advance(self, seconds: float) -> None:

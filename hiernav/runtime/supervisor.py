@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
@@ -66,8 +65,6 @@ class Supervisor:
         """Why it is in FAULT or ESTOP."""
         self._kinds: list[str] = []
         """Of the reasons in `fault`."""
-        self.history: deque[tuple[float, Mode, str]] = deque(maxlen=256)
-        """Last changes: time [s], mode entered, why."""
 
     @property
     def driving(self) -> bool:
@@ -127,7 +124,6 @@ class Supervisor:
 
     def _enter(self, mode: Mode, why: str, now: float) -> None:
         self.mode, self.why = mode, why
-        self.history.append((now, mode, why))
         if self._changed is not None:
             self._changed(now, mode, why)
 

@@ -236,7 +236,7 @@ def test_no_way_out_is_looked_for_from_an_unknown_pose() -> None:
 
 
 def ways(plan: np.ndarray, yaw: float = 0.0, occupancy: OccupancyMap = FREE) -> list[np.ndarray]:
-    return ways_out(np.array([0.0, 0.0, yaw]), plan, occupancy, 0.1)
+    return list(ways_out(np.array([0.0, 0.0, yaw]), plan, occupancy, 0.1)[1])
 
 
 def bearings(ways: list[np.ndarray], yaw: float = 0.0) -> list[int]:

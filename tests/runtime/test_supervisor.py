@@ -87,7 +87,9 @@ def test_there_is_nothing_to_acknowledge_without_a_fault():
         Supervisor().acknowledge(0.0)
 
 
-def test_every_change_is_remembered_with_its_reason():
-    supervisor = supervisor_in(Mode.READY)
+def test_every_change_is_told_with_its_reason():
+    told: list[tuple[float, Mode, str]] = []
+    supervisor = Supervisor(lambda *change: told.append(change))
+    supervisor.change(Mode.READY, "test", 0.0)
     supervisor.fail("pinned", 2.5)
-    assert list(supervisor.history) == [(0.0, Mode.READY, "test"), (2.5, Mode.FAULT, "pinned")]
+    assert told == [(0.0, Mode.READY, "test"), (2.5, Mode.FAULT, "pinned")]
