@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Benchmarks, each as a ratio within one run: ours beside what bounds it.
 
-    --env     control steps/s of the batched task against bare `mj_step` of the same scenes
+    --env     control steps/s of the batched task against bare `mj_step` of the same scenes, and with --safety-python
+              against Safety-Gymnasium (see tools/env_peers.py)
     --update  SAC updates/s against the same update hand-written in plain torch, and the machine's matrix-product peak
     --peers   SAC updates/s beside torchrl's plain loop, Stable-Baselines3 and SBX (see tools/sac_peers.py); on request
     --tick    cost of one control step on the robot side, by section
@@ -44,6 +45,7 @@ def main() -> int:
     parser.add_argument("--hidden", type=whole(), default=256, help="of both layers, for --update and --peers (256)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of the updates, for --peers (cpu)")
     parser.add_argument("--peer-python", default=sys.executable, metavar="PATH", help="that the peers are installed in")
+    parser.add_argument("--safety-python", metavar="PATH", help="that has Safety-Gymnasium, for --env")
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="for --tick and --plan")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from race import Stretch, overall, race, timed
+from turns import Skipped, Turns
 
 from hiernav.config import load_config
 from hiernav.nav.bundle import load_bundle
@@ -42,16 +43,34 @@ def _bench_robot(robot: str, arguments: argparse.Namespace) -> dict[str, Any]:
     bundle = load_bundle(BUNDLES / (robot if (BUNDLES / robot).exists() else "car"))
     planner = make_planner(bundle, load_policies(bundle).planner, get_robot(robot).radius)
     contenders["learned planner, 1"] = partial(timed, Driven(_task(robot, 1, planner)).step)
+    peer = _peer(robot, arguments.safety_python)
+    if peer is not None:
+        contenders["Safety-Gymnasium, 1"] = peer
     rates = overall(race(contenders, arguments.seconds, 0.1))
+    if peer is not None:
+        peer.close()
     for name, rate in rates.items():
         what, threads = name.split(", ")
         line = f"env {robot:6s} {what:16s} {threads} thread(s) {rate:8,.0f} steps/s"
-        if what != "bare mj_step":
+        if what.endswith("planner"):
             line += f"   {rate / rates[f'bare mj_step, {threads}']:.2f} of bare mj_step"
+        if what.endswith("planner") and peer is not None:
+            line += f"   {rate / rates['Safety-Gymnasium, 1']:.1f} times Safety-Gymnasium"
         if threads != "1":
             line += f"   {rate / rates[f'{what}, 1']:.2f} times one thread"
         print(line)
     return rates
+
+
+def _peer(robot: str, python: str | None) -> Turns | None:
+    """Safety-Gymnasium's environment of the same robot, in a process and a Python of its own."""
+    if python is None:
+        return None
+    try:
+        return Turns([python, "-W", "ignore", str(Path(__file__).parent / "env_peers.py"), robot])
+    except Skipped as reason:
+        print(f"env {robot:6s} Safety-Gymnasium skipped: {reason}")
+        return None
 
 
 def _task(robot: str, threads: int, planner: Planner | None = None) -> NavigationTask:

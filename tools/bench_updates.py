@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from race import race, timed, typical
+from turns import Skipped, Turns
 
 
 def bench_update(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -54,36 +54,21 @@ def bench_peers(arguments: argparse.Namespace) -> dict[str, Any]:
 
     print("peers: starting", end="", flush=True)
     options = ["--threads", str(arguments.threads), "--hidden", str(arguments.hidden), "--device", arguments.device]
-    workers, skipped = {}, {}
+    workers: dict[str, Turns] = {}
+    skipped: dict[str, str] = {}
     for name in LEARNERS:
         print(f" {name}", end="", flush=True)
         python = arguments.peer_python if name in ("sb3", "sbx") else sys.executable
-        worker = subprocess.Popen(
-            [python, "-W", "ignore", str(Path(__file__).parent / "sac_peers.py"), name, *options],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        # libraries print to the same stream
-        lines = iter(worker.stdout.readline, "")  # type: ignore[union-attr]
-        answer = next((line.strip() for line in lines if line.startswith(("ready", "skip"))), "skip it ended")
-        if answer == "ready":
-            workers[name] = worker
-        else:
-            skipped[name] = answer.removeprefix("skip ")
+        try:
+            workers[name] = Turns([python, "-W", "ignore", str(Path(__file__).parent / "sac_peers.py"), name, *options])
+        except Skipped as reason:
+            skipped[name] = str(reason)
     print()
-
-    def turn(worker: subprocess.Popen[str], seconds: float) -> tuple[int, float]:
-        print(seconds, file=worker.stdin, flush=True)
-        count, spent = worker.stdout.readline().split()  # type: ignore[union-attr]
-        return int(count), float(spent)
-
     try:
-        rates = typical(race({name: partial(turn, worker) for name, worker in workers.items()}, arguments.seconds, 0.5))
+        rates = typical(race(workers, arguments.seconds, 0.5))
     finally:
         for worker in workers.values():
-            worker.stdin.close()  # type: ignore[union-attr]
-            worker.wait()
+            worker.close()
     best = max((rates[name] for name in PEERS if name in rates), default=float("nan"))
     for name, rate in rates.items():
         print(

@@ -2,10 +2,9 @@
 
     python tools/sac_peers.py NAME [--threads 1] [--hidden 256] [--device cpu]
 
-prints "ready", or "skip" and a reason; from then on it answers each line it reads, a number of seconds, with the
-updates done in that time and the seconds it took. An update is a batch of 256 drawn from a replay buffer and one
-gradient step of actor, twin critics and temperature, at the quadruped's sizes. Each learner runs as its own
-documentation shows it.
+prints "ready", or "skip" and a reason, and then takes turns (see tools/turns.py). An update is a batch of 256 drawn
+from a replay buffer and one gradient step of actor, twin critics and temperature, at the quadruped's sizes. Each
+learner runs as its own documentation shows it.
 
 The peers, in an environment of their own:
 
@@ -21,12 +20,12 @@ import os
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from turns import take_turns
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -205,14 +204,13 @@ def main() -> None:
         print(f"skip {error}", flush=True)
         return
     wait = torch.cuda.synchronize if arguments.device == "cuda" and arguments.name != "sbx" else lambda: None
-    print("ready", flush=True)
-    for line in sys.stdin:
-        count, began = 0, time.perf_counter()
-        while (spent := time.perf_counter() - began) < float(line):
-            burst()
-            wait()
-            count += BURST
-        print(count, spent, flush=True)
+
+    def run() -> int:
+        burst()
+        wait()
+        return BURST
+
+    take_turns(run)
 
 
 if __name__ == "__main__":
