@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from hiernav.nav.mapfile import load_map
     from hiernav.nav.observation import ObservationLayout
     from hiernav.nav.occupancy import OccupancyMap, VisitMap
-    from hiernav.nav.option import HierarchicalAgent, Planner, ReplanRule, TerminationReason, WaypointOption
+    from hiernav.nav.option import (
+        HierarchicalAgent,
+        Planner,
+        PlanQuery,
+        ReplanRule,
+        TerminationReason,
+        WaypointOption,
+    )
+    from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner
     from hiernav.nav.search import PathField
     from hiernav.runtime.policy import make_agent
     from hiernav.sim.batch import BatchSim
@@ -40,9 +48,12 @@ _HOME = {
     "VisitMap": "hiernav.nav.occupancy",
     "HierarchicalAgent": "hiernav.nav.option",
     "Planner": "hiernav.nav.option",
+    "PlanQuery": "hiernav.nav.option",
     "ReplanRule": "hiernav.nav.option",
     "TerminationReason": "hiernav.nav.option",
     "WaypointOption": "hiernav.nav.option",
+    "ShortestPathPlanner": "hiernav.nav.planners",
+    "VerifiedPlanner": "hiernav.nav.planners",
     "PathField": "hiernav.nav.search",
     "make_agent": "hiernav.runtime.policy",
     "BatchSim": "hiernav.sim.batch",
@@ -60,10 +71,13 @@ __all__ = [
     "ObservationLayout",
     "OccupancyMap",
     "PathField",
+    "PlanQuery",
     "Planner",
     "ReplanRule",
+    "ShortestPathPlanner",
     "TerminationReason",
     "TrainConfig",
+    "VerifiedPlanner",
     "VisitMap",
     "WaypointOption",
     "__version__",

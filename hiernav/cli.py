@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments, more = parser.parse_known_args(argv)
     if more:
         if "overrides" not in arguments or any(text.startswith("-") for text in more):
-            parser.error(f"unrecognized arguments: {' '.join(more)}")
+            arguments.parser.error(f"unrecognized arguments: {' '.join(more)}")
         arguments.overrides += more  # argparse itself takes one group of KEY=VALUE, but no second one after an option
     try:
         with _sigterm_as_ctrl_c():
@@ -136,7 +136,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RUN|BUNDLE",
         help="fine-tune the planner of this run or bundle into a new run, which takes over its skill (--stage planner)",
     )
-    train.add_argument("--worlds", action="append", metavar="WORLD", help="repeat for a mix (planner.worlds)")
+    train.add_argument(
+        "--worlds",
+        action="append",
+        metavar="WORLD",
+        help="train in this world; repeat for a mix (planner.worlds, skill.worlds, or both, by --stage)",
+    )
     train.add_argument(
         "--collector",
         choices=("local", "multi", "ray"),
@@ -144,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.add_argument("--workers", metavar="N", help="processes that simulate, for multi and ray (skill.workers)")
     train.add_argument("--ray-address", metavar="ADDRESS", help="Ray cluster to join (skill.ray_address)")
-    train.set_defaults(run=_train)
+    train.set_defaults(run=_train, parser=train)
 
     evaluate = commands.add_parser(
         "evaluate",
@@ -159,7 +164,10 @@ def _parser() -> argparse.ArgumentParser:
         "--world", action="append", metavar="WORLD", help="a world; repeat for several (pillar(2,2,10))"
     )
     evaluate.add_argument(
-        "--protocol", choices=("paper", "strict"), default="strict", help="how to count (strict: 1000 episodes)"
+        "--protocol",
+        choices=("paper", "strict"),
+        default="strict",
+        help="how to count (strict): strict is of 1000 episodes; paper of 200, and counts no contacts with gremlins",
     )
     evaluate.add_argument("--planner", choices=("cnn", "astar"), default="cnn", help="who plans (cnn)")
     evaluate.add_argument(
@@ -170,7 +178,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--episodes", type=int, metavar="N", help="per world (protocol's number)")
     evaluate.add_argument("--seed", type=int, default=0, help="decides the worlds (0)")
     evaluate.add_argument("--json", metavar="FILE", help="write the results, an object per world; - for the screen")
-    evaluate.set_defaults(run=_evaluate)
+    evaluate.set_defaults(run=_evaluate, parser=evaluate)
 
     watch = commands.add_parser(
         "watch",
@@ -195,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument(
         "--out", type=Path, metavar="PATH", help="a film ending in .mp4 or .gif, or a folder (RUN/films, or runs/films)"
     )
-    watch.set_defaults(run=_watch)
+    watch.set_defaults(run=_watch, parser=watch)
 
     export = commands.add_parser(
         "export",
@@ -211,7 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         required=True,
         help="write a bundle of ONNX files; DIR is replaced if it holds one (RUN/bundle)",
     )
-    export.set_defaults(run=_export)
+    export.set_defaults(run=_export, parser=export)
 
     replay = commands.add_parser(
         "replay",
@@ -222,7 +230,7 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("recording", metavar="RUN.mcap", help="the recording")
     replay.add_argument("--bundle", metavar="DIR", help="policies (those of the recording)")
     replay.add_argument("--json", metavar="FILE", help="write the result; - for the screen")
-    replay.set_defaults(run=_replay)
+    replay.set_defaults(run=_replay, parser=replay)
 
     dataset = commands.add_parser(
         "dataset",
@@ -239,7 +247,7 @@ def _parser() -> argparse.ArgumentParser:
     dataset.add_argument("--sheet", metavar="FILE", help="write a PNG of some samples")
     dataset.add_argument("--check", action="store_true", help="make nothing: read all of it and check it")
     dataset.add_argument("--json", action="store_true", help="print what was made as JSON")
-    dataset.set_defaults(run=_dataset)
+    dataset.set_defaults(run=_dataset, parser=dataset)
 
     report = commands.add_parser(
         "report",
@@ -252,7 +260,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument(
         "--curves", type=Path, metavar="FILE", help="draw the training curves of all robots as well (PNG, SVG or PDF)"
     )
-    report.set_defaults(run=_report)
+    report.set_defaults(run=_report, parser=report)
 
     world = commands.add_parser(
         "world", help="draw a world", description="Sample a world from a seed and draw it, or print it as JSON."
@@ -262,7 +270,7 @@ def _parser() -> argparse.ArgumentParser:
     world.add_argument("--radius", type=float, default=0.1, help="of the robot it must be solvable for [m] (0.1)")
     world.add_argument("--png", metavar="FILE", help="picture to write")
     world.add_argument("--json", action="store_true", help="print the layout as JSON")
-    world.set_defaults(run=_world)
+    world.set_defaults(run=_world, parser=world)
 
     config = commands.add_parser(
         "config",
@@ -270,7 +278,7 @@ def _parser() -> argparse.ArgumentParser:
         description="List every setting with its default, or print a resolved configuration as YAML.",
     )
     _add_configuration(config, "resolve this file instead of listing the settings")
-    config.set_defaults(run=_config)
+    config.set_defaults(run=_config, parser=config)
     return parser
 
 
@@ -288,7 +296,8 @@ def _train(arguments: argparse.Namespace) -> int:
     flags["skill.ray_address"] = arguments.ray_address
     overrides = [f"{key}={value}" for key, value in flags.items() if value is not None] + arguments.overrides
     if arguments.worlds:
-        overrides.append(f"planner.worlds={json.dumps(arguments.worlds)}")
+        trained = ("planner", "skill") if arguments.stage == "all" else (arguments.stage,)
+        overrides += [f"{stage}.worlds={json.dumps(arguments.worlds)}" for stage in trained]
     if arguments.source:
         if arguments.stage != "planner" or arguments.config or arguments.resume:
             raise RunError("--from fine-tunes the planner: use it with --stage planner, without --config and --resume")
@@ -296,7 +305,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
         config = fine_tuning_config(arguments.source, overrides)
         _check_training(config, arguments.stage)
-        run = begin_fine_tuning(config, arguments.source)
+        run = begin_fine_tuning(_with_worlds_of_data(config, overrides), arguments.source)
     elif arguments.resume:
         if arguments.config or overrides:
             raise RunError(
@@ -308,7 +317,7 @@ def _train(arguments: argparse.Namespace) -> int:
         config = load_config(arguments.config, overrides)
         _check_collector(config, overrides)
         _check_training(config, arguments.stage)
-        run = Run.create(config)
+        run = Run.create(_with_worlds_of_data(config, overrides))
     from hiernav.training import train
 
     print(f"run folder: {run.path}")
@@ -317,12 +326,17 @@ def _train(arguments: argparse.Namespace) -> int:
             train(run, arguments.stage, progress)
     except KeyboardInterrupt as error:
         again = f"hiernav train --resume {run.path}" + (arguments.stage != "all") * f" --stage {arguments.stage}"
-        print(f"stopped; go on from the last checkpoint with: {again}", file=sys.stderr)
+        saved = any(run.has(stage) for stage in ("planner", "skill"))
+        where = "go on from the last checkpoint" if saved else "there is no checkpoint yet, begin it again"
+        print(f"stopped; {where} with: {again}", file=sys.stderr)
         return _interruption(error)
     finally:
         run.close()
+    missing = [stage for stage in ("planner", "skill") if not run.has(stage)]
     if run.config.skill.preset == "baseline":
         print(f"done; measure with: hiernav evaluate --run {run.path}")
+    elif missing:
+        print(f"done; train the {missing[0]} with: hiernav train --resume {run.path} --stage {missing[0]}")
     else:
         print(f"done; export with: hiernav export --run {run.path} --onnx")
     return 0
@@ -343,14 +357,15 @@ def _worlds(arguments: argparse.Namespace) -> list[WorldSpec]:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from hiernav.evaluate import EPISODES, evaluate, open_policies
+    from hiernav.evaluate import EPISODES, evaluate, fingerprints, open_policies
 
     worlds = _worlds(arguments)
     if arguments.no_repair and arguments.planner == "astar":
         raise ValueError("--no-repair is for plans of the network, with --planner astar there are none")
     if arguments.json and arguments.json != "-" and Path(arguments.json).is_dir():
         raise ValueError(f"--json {arguments.json} is a folder, it must be a file")
-    policies = open_policies(arguments.bundle or arguments.run_path)
+    source = arguments.bundle or arguments.run_path
+    policies, files = open_policies(source), fingerprints(source)
     robot = policies.config.robot
     if arguments.robot and arguments.robot != robot:
         raise ValueError(f"these policies are for robot {robot!r}, not {arguments.robot!r}")
@@ -377,6 +392,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             recover=not arguments.no_recovery,
             predict=not arguments.no_prediction,
         )
+    results = {world: {"policies": source, "sha256": files, **row} for world, row in results.items()}
     if arguments.json == "-":
         print(json.dumps(results, indent=2))
     else:
@@ -564,6 +580,8 @@ def _world(arguments: argparse.Namespace) -> int:
     from hiernav.sim.layout import parse_world
     from hiernav.sim.worlds import sample_layout
 
+    if arguments.png and Path(arguments.png).suffix != ".png":
+        raise ValueError(f"--png {arguments.png} must end in .png")
     layout = sample_layout(parse_world(arguments.kind), arguments.seed, arguments.radius)
     if arguments.json or not arguments.png:
         shown = {
@@ -588,6 +606,7 @@ def _world(arguments: argparse.Namespace) -> int:
 
 def _config(arguments: argparse.Namespace) -> int:
     from hiernav.config import describe_config, dump_config, load_config
+    from hiernav.decode import as_text
 
     if arguments.config or arguments.overrides:
         print(dump_config(load_config(arguments.config, arguments.overrides)), end="")
@@ -598,7 +617,7 @@ def _config(arguments: argparse.Namespace) -> int:
     table = Table("key", "type", "default", "what it is", box=None, pad_edge=False)
     for setting in describe_config():
         # escaped: units in brackets are no markup
-        table.add_row(*map(escape, (setting.path, setting.type, str(setting.default), setting.description)))
+        table.add_row(*map(escape, (setting.path, setting.type, as_text(setting.default), setting.description)))
     _console(piped_width=1_000).print(table)  # one line per setting, for grep
     return 0
 
@@ -610,6 +629,25 @@ def _check_training(config: TrainConfig, stage: str) -> None:
     _check_scene(config)
     _check_machine(config)
     _check_data(config)
+
+
+def _with_worlds_of_data(config: TrainConfig, overrides: list[str]) -> TrainConfig:
+    """A planner that learns from a data set learns the worlds of that."""
+    from hiernav.config import ConfigError
+
+    if config.planner.data is None or config.skill.preset == "baseline":
+        return config
+    import msgspec
+
+    from hiernav.planner.train import settings_of_data
+
+    worlds = settings_of_data(config).worlds
+    if any(text.startswith("planner.worlds=") for text in overrides) and config.planner.worlds != worlds:
+        raise ConfigError(
+            f"planner.worlds = {list(config.planner.worlds)}, but planner.data = {config.planner.data!r} "
+            f"was made in {list(worlds)}: leave one of them out"
+        )
+    return msgspec.structs.replace(config, planner=msgspec.structs.replace(config.planner, worlds=worlds))
 
 
 def _check_collector(config: TrainConfig, overrides: list[str]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -98,12 +99,18 @@ def decode(kind: type[S], values: Any, source: str | Callable[[str], str]) -> S:
             raise ConfigError(f"{origin(path)}: {error}") from None
         raise ConfigError(
             f"{origin(path)}: {path} = {_value_at(values, path)!r}, expected {fields[path].help.type}"
+            f"{_way_to_write(_value_at(values, path), fields[path].help.type)}"
         ) from None
 
 
 def describe(kind: type[msgspec.Struct]) -> list[FieldHelp]:
     """Every setting of a struct and of the structs in it, in order of declaration."""
     return [field.help for field in _fields(kind).values() if field.nested is None]
+
+
+def as_text(value: Any) -> str:
+    """A setting's value as it is written in YAML, on one line."""
+    return json.dumps(value)
 
 
 def unknown_key(path: str, known: Iterable[str]) -> str:
@@ -170,6 +177,16 @@ def _leaves(values: Any, fields: dict[str, _Field], prefix: str = "") -> Iterato
         yield path, value
         if isinstance(value, dict) and path in fields and fields[path].nested:
             yield from _leaves(value, fields, path + ".")
+
+
+def _way_to_write(value: Any, wanted: str) -> str:
+    """How a value of nearly the wanted type is written."""
+    if isinstance(value, str) and "list of" in wanted:
+        numbers = re.fullmatch(r"[-+.\d]+(,[-+.\d]+)*", value.replace(" ", ""))
+        return f": write [{value}]" if numbers else f": write {as_text([value])}"
+    if isinstance(value, float) and wanted.startswith("int") and value.is_integer():
+        return f": write {int(value)}"
+    return ""
 
 
 def _value_at(values: Any, path: str) -> Any:

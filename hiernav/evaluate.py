@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from hiernav.config import OptionConfig, TrainConfig, load_config
-from hiernav.nav.bundle import MANIFEST, file_sha256, load_bundle
+from hiernav.nav.bundle import MANIFEST, PLANNER, SKILL, file_sha256, load_bundle
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
@@ -66,6 +66,12 @@ def open_policies(path: str | Path) -> Policies:
     if path.is_dir() and not (path / MANIFEST).exists():
         raise ValueError(f"{path} is neither a run folder (it has no config.yaml) nor a bundle (no {MANIFEST})")
     return _from_bundle(path)
+
+
+def fingerprints(path: str | Path) -> dict[str, str]:
+    """SHA-256 of each file that makes the policies of a bundle or of a run folder, by its name in there."""
+    names = (PLANNER, SKILL, MANIFEST, "planner/checkpoint.pt", "skill/checkpoint.pt", "config.yaml")
+    return {name: file_sha256(Path(path) / name) for name in names if (Path(path) / name).is_file()}
 
 
 def make_planner(policies: Policies, kind: str, repair: bool = True) -> Planner:

@@ -139,6 +139,10 @@ class Run:
             write_atomically(folder / "checkpoint.pt", buffer.getvalue())
             sync(self.path)
 
+    def has(self, stage: str) -> bool:
+        """Whether a stage has a checkpoint."""
+        return (self.path / stage / "checkpoint.pt").exists()
+
     def load(self, stage: str, rewind: bool = False) -> dict[str, Any] | None:
         """A stage's checkpoint, or None; `rewind` cuts off logs that are newer than every stage's checkpoint.
 

@@ -50,6 +50,8 @@ def _train(run: Run, stage: str, progress: Progress) -> None:
     check_stage(run.config, stage, planner.finished)
     if done and not planner.finished:
         _say_resumed(progress, run, "planner", f"epoch {done} of {run.config.planner.epochs}")
+    if stage == "planner" and planner.finished:
+        _say_finished(progress, stage)
     if stage in ("planner", "all") and not planner.finished:
         run.start_clock("planner")
         planner.train(_PlannerDisplay(progress))
@@ -68,6 +70,8 @@ def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
     steps = skill.resume()
     if steps is not None and not skill.finished:
         _say_resumed(progress, run, "skill", f"step {steps:,} of {run.config.skill.total_steps:,}")
+    if skill.finished:
+        _say_finished(progress, "skill")
     run.start_clock("skill")
     skill.train(_SkillDisplay(progress))
     shipped = skill_train.kept(skill.evaluations, run.config.skill.eval_episodes)
@@ -78,6 +82,12 @@ def _say_resumed(progress: Progress, run: Run, stage: str, done: str) -> None:
     when = run.saved_at(stage).strftime("%Y-%m-%d %H:%M:%S")
     progress.console.print(
         f"{stage}: going on after {done}, from the checkpoint of {when}", soft_wrap=True, highlight=False
+    )
+
+
+def _say_finished(progress: Progress, stage: str) -> None:
+    progress.console.print(
+        f"{stage}: finished already; to train for longer, begin a new run", soft_wrap=True, highlight=False
     )
 
 

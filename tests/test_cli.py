@@ -423,7 +423,7 @@ def test_ctrl_c_in_the_middle_of_a_librarys_bookkeeping_is_ctrl_c(tmp_path, caps
 
     monkeypatch.setattr("hiernav.skill.train.SkillTrainer.train", interrupted)
     assert cli.main(["train", "--stage", "skill", *tiny_run.arguments(tmp_path / "run")]) == 130
-    assert "stopped; go on from the last checkpoint" in capsys.readouterr().err
+    assert "stopped; there is no checkpoint yet" in capsys.readouterr().err
 
 
 def test_sigterm_cleans_up_like_ctrl_c(tmp_path, capsys, monkeypatch):
@@ -521,3 +521,99 @@ def await_file(file: Path, process: subprocess.Popen[str], timeout: float = 120.
             process.kill()
             pytest.fail(f"{file.name} never came: {process.communicate()}")
         time.sleep(0.01)
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("stage", "planner", "skill"),
+    [("planner", "two-room", tiny_run.WORLD), ("skill", tiny_run.WORLD, "two-room"), ("all", "two-room", "two-room")],
+)
+def test_worlds_on_the_command_line_are_those_of_what_is_trained(tmp_path, monkeypatch, stage, planner, skill):
+    monkeypatch.setattr("hiernav.training.train", lambda *_: None)
+    settings = tiny_run.arguments(tmp_path / "run")
+    assert cli.main(["train", "--stage", stage, "--worlds", "two-room", *settings]) == 0
+    config = load_config(tmp_path / "run" / "config.yaml")
+    assert (config.planner.worlds, config.skill.worlds) == ((planner,), (skill,))
+
+
+@pytest.mark.train
+def test_a_planner_that_learns_from_a_data_set_says_so_with_the_worlds_of_that(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("hiernav.training.train", lambda *_: None)
+    settings = [*tiny_run.SETTINGS, "planner.samples=12"]
+    assert cli.main(["dataset", "--out", "data", "--samples", "12", "--world", "pillar(1.5,1.5,1)", *settings]) == 0
+    assert cli.main(["train", *settings, "planner.data=data", "run_dir=run"]) == 2  # SETTINGS have worlds of their own
+    settings = [text for text in settings if not text.startswith("planner.worlds")]
+    assert cli.main(["train", *settings, "planner.data=data", "run_dir=run"]) == 0
+    assert load_config(tmp_path / "run" / "config.yaml").planner.worlds == ("pillar(1.5,1.5,1)",)
+    line = refused("train", *settings, "planner.data=data", "planner.worlds=['four-room']")
+    assert "planner.worlds = ['four-room'], but planner.data = 'data' was made in ['pillar(1.5,1.5,1)']" in line
+
+
+@pytest.mark.train
+def test_a_stage_says_what_to_do_after_it_and_that_it_is_finished(tmp_path, capsys):
+    settings = tiny_run.arguments(tmp_path / "run", "skill.total_steps=512", "skill.eval_every_steps=512")
+    assert cli.main(["train", "--stage", "planner", *settings]) == 0
+    again = f"hiernav train --resume {tmp_path / 'run'} --stage"
+    assert capsys.readouterr().out.endswith(f"done; train the skill with: {again} skill\n")
+    assert cli.main(again.split()[1:] + ["planner"]) == 0
+    assert "planner: finished already" in capsys.readouterr().err
+    assert cli.main(again.split()[1:] + ["skill"]) == 0
+    assert capsys.readouterr().out.endswith(f"done; export with: hiernav export --run {tmp_path / 'run'} --onnx\n")
+    assert cli.main(again.split()[1:] + ["all"]) == 0
+    assert "skill: finished already; to train for longer, begin a new run" in capsys.readouterr().err
+
+
+def test_a_training_that_is_stopped_before_its_first_checkpoint_says_that_it_begins_again(
+    tmp_path, capsys, monkeypatch
+):
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hiernav.training.train", stopped)
+    assert cli.main(["train", *tiny_run.arguments(tmp_path / "run")]) == 130
+    told = f"stopped; there is no checkpoint yet, begin it again with: hiernav train --resume {tmp_path / 'run'}\n"
+    assert capsys.readouterr().err.lstrip() == told
+
+
+def test_defaults_are_listed_as_they_are_written(capsys):
+    assert cli.main(["config"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    for key, default in (
+        ("skill.alpha_fall", "[0.5, 1.0]"),
+        ("skill.stop_reach_rate", "null"),
+        ("skill.mirror", "true"),
+    ):
+        assert f" {default} " in lines[key]
+        load_config(None, [f"{key}={default}"])
+
+
+@pytest.mark.parametrize(
+    ("given", "hint"),
+    [
+        ("planner.worlds=two-room", 'write ["two-room"]'),
+        ("planner.worlds='pillar(2,2,10)'", 'write ["pillar(2,2,10)"]'),
+        ("skill.hidden=128,128", "write [128,128]"),
+        ("skill.total_steps=1e5", "write 100000"),
+    ],
+)
+def test_a_value_of_nearly_the_right_type_is_told_how_it_is_written(refused, given, hint):
+    assert refused("config", given).endswith(f": {hint}\n")
+    load_config(None, [f"{given.partition('=')[0]}={hint.removeprefix('write ')}"])
+
+
+def test_an_unknown_option_is_told_with_the_options_of_its_command(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", "--bundle", "b", "--worlds", "gremlin"])
+    assert capsys.readouterr().err.startswith("usage: hiernav evaluate ")
+
+
+def test_a_picture_of_a_world_is_a_png(refused):
+    assert "--png world.txt must end in .png" in refused("world", "--png", "world.txt")
+
+
+def test_an_evaluation_says_whose_it_is(tmp_path, capsys):
+    bundle = Path(__file__).parents[1] / "deploy" / "bundles" / "point"
+    arguments = ["evaluate", "--bundle", str(bundle), "--world", "pillar(1.2,1.2,2)", "--episodes", "1", "--json", "-"]
+    assert cli.main(arguments) == 0
+    row = json.loads(capsys.readouterr().out)["pillar(1.2,1.2,2)"]
+    assert row["policies"] == str(bundle) and set(row["sha256"]) == {"planner.onnx", "skill.onnx", "manifest.json"}

@@ -23,7 +23,7 @@ from hiernav.finetune import begin_fine_tuning, fine_tuning_config  # noqa: E402
 from hiernav.nav.bundle import load_bundle  # noqa: E402
 from hiernav.planner import train as planner_train  # noqa: E402
 from hiernav.planner.network import make_network  # noqa: E402
-from hiernav.run import Run  # noqa: E402
+from hiernav.run import Run, RunError  # noqa: E402
 from hiernav.skill.train import make_learner  # noqa: E402
 
 pytestmark = pytest.mark.train
@@ -64,6 +64,38 @@ def test_the_planner_of_a_bundle_goes_on_learning_by_its_preset(doggo_bundle: Pa
     assert (paper.clearance_weight, paper.heading_weight, paper.weight_decay) == (0.0, 0.0, 0.0)
     ours, default = fine_tuning_config(able_bundle, []).planner, load_config().planner
     assert (ours.preset, ours.mirror, ours.heading_weight) == ("default", default.mirror, default.heading_weight)
+
+
+def test_folder_data_and_length_of_a_fine_tuning_are_its_own_and_all_else_is_the_sources(tmp_path: Path):
+    theirs = tiny_run.config(tmp_path / "source", f"planner.data={tmp_path / 'data'}", "planner.weight_decay=0.5")
+    source = Run.create(theirs).path
+    ours = fine_tuning_config(source, [])
+    assert (ours.run_dir, ours.planner.data) == (None, None)
+    assert (ours.planner.samples, ours.planner.epochs, ours.planner.learning_rate) == (20_000, 4, 3e-4)
+    kept = ("worlds", "preset", "hypotheses", "batch_size", "weight_decay", "samples_per_world")
+    assert all(getattr(ours.planner, name) == getattr(theirs.planner, name) for name in kept)
+    assert (ours.robot, ours.seed, ours.option, ours.skill) == (theirs.robot, theirs.seed, theirs.option, theirs.skill)
+    assert fine_tuning_config(source, ["planner.epochs=9"]).planner.epochs == 9
+
+
+def test_what_is_known_of_a_skill_goes_on_from_bundle_to_bundle(able_bundle: Path, tmp_path: Path):
+    config = fine_tuning_config(able_bundle, [f"run_dir={tmp_path / 'tuned'}"])
+    skill = begin_fine_tuning(config, able_bundle).load("skill")
+    known = load_bundle(able_bundle).manifest.provenance
+    assert known["skill_steps"] > 0 and known["skill_updates"] > 0
+    assert (skill["steps"], skill["learner"]["updates"]) == (known["skill_steps"], known["skill_updates"])
+    assert [entry["reach_rate"] for entry in skill["evaluations"]] == [known["skill_reach_rate"]]
+    assert skill["evaluations"][0]["step"] == known["skill_steps"]
+
+
+@pytest.mark.parametrize("stage", ["planner", "skill"])
+def test_a_run_that_lacks_a_network_is_told_to_go_on(able_run: Path, tmp_path: Path, stage: str):
+    source = Path(shutil.copytree(able_run, tmp_path / "source"))
+    shutil.rmtree(source / stage)
+    config = fine_tuning_config(source, [f"run_dir={tmp_path / 'tuned'}"])
+    with pytest.raises(RunError, match=f"has no trained {stage}: go on with `hiernav train --resume {source}`"):
+        begin_fine_tuning(config, source)
+    assert not (tmp_path / "tuned").exists()
 
 
 def test_training_starts_from_the_weights_of_the_source_and_says_how_good_they_are(able_run: Path, tmp_path: Path):

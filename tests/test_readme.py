@@ -21,7 +21,7 @@ def snippets() -> list[str]:
 
 
 def test_there_are_snippets() -> None:
-    assert len(snippets()) == 2
+    assert len(snippets()) == 3
 
 
 @pytest.mark.parametrize("code", snippets())

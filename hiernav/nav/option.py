@@ -453,13 +453,15 @@ class HierarchicalAgent:
     def __post_init__(self) -> None:
         self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
+        self._goal = np.full((self.option.num_rows, 2), np.nan)  # what the plans lead to
         self._clocked = "clock" in self.layout.names
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
         self.option.reset(rows)
         self.recovery.reset(rows)
-        self._steps[slice(None) if rows is None else rows] = 0
+        pick = slice(None) if rows is None else rows
+        self._steps[pick], self._goal[pick] = 0, np.nan
 
     def act(
         self,
@@ -474,10 +476,23 @@ class HierarchicalAgent:
         Args:
             pose: (N, 3) world frame [m, m, rad].
             terms: the robot's sensors by name, (N, d) each; waypoints and goal are added here.
-            goal: (N, 2) world frame [m].
+            goal: (N, 2) world frame [m]. Where it has moved by more than `option.goal_radius` since the plan was made,
+                the plan is void.
             occupancy: N maps as they are now.
             stamps: (N,) when the maps were made, on any clock [s]; the time of the steps by default.
+
+        Raises:
+            ValueError: not as many rows as the agent was made for.
         """
+        pose, goal = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+        shapes, rows = (pose.shape, goal.shape, len(occupancy)), self.option.num_rows
+        if shapes != ((rows, 3), (rows, 2), rows):
+            raise ValueError(
+                f"HierarchicalAgent.act: poses {pose.shape}, goals {goal.shape} and {len(occupancy)} maps, "
+                f"expected ({rows}, 3), ({rows}, 2) and {rows}"
+            )
+        if not np.array_equal(goal, self._goal):
+            self._take_goals(goal)
         since = self._steps * self.control_period
         step, plan, observation = observe(
             self.option,
@@ -492,6 +507,13 @@ class HierarchicalAgent:
         )
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
+
+    def _take_goals(self, goal: np.ndarray) -> None:
+        """Drop the plans that lead to other goals (N, 2) than these."""
+        new = np.isnan(self._goal).any(axis=1)
+        moved = path.distances(goal, self._goal) > self.option.goal_radius
+        self.option.drop(np.flatnonzero(moved))
+        self._goal[new | moved] = goal[new | moved]
 
 
 def observe(

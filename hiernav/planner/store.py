@@ -96,7 +96,10 @@ def write_dataset(
 def _begun(folder: Path, wanted: Manifest) -> Manifest:
     """The wanted data set with what the folder has of it."""
     if (folder / MANIFEST).exists():
-        there = _compatible(folder, read_manifest(folder), wanted)
+        there = read_manifest(folder)
+        if not there.made:
+            return wanted
+        _require_compatible(folder, there, wanted)
         if wanted.samples < there.made:
             raise DatasetError(
                 f"{folder} has {there.made:,} samples already, {wanted.samples:,} are wanted: choose another folder, "
@@ -121,9 +124,10 @@ def _make_missing(
         kept += 1
     shards = list(manifest.shards[:kept])
     tasks = [(folder, settings, manifest.seed, number, worlds, wanted[number]) for number in range(kept, len(wanted))]
-    if not tasks:  # all are there, though more may have been wanted before
-        _write_manifest(folder, manifest)
-    done = sum(shard.samples for shard in shards)
+    # before any shard is written: it names none that is about to be replaced, and shows whose the first ones are
+    manifest = msgspec.structs.replace(manifest, shards=tuple(shards))
+    _write_manifest(folder, manifest)
+    done = manifest.made
     if on_progress is not None:
         on_progress(done)
     for shard in map_tasks(_make_shard, tasks, processes):
@@ -133,7 +137,7 @@ def _make_missing(
         _write_manifest(folder, manifest)
         if on_progress is not None:
             on_progress(done)
-    return msgspec.structs.replace(manifest, shards=tuple(shards))
+    return manifest
 
 
 def read_manifest(folder: str | Path) -> Manifest:
@@ -185,14 +189,13 @@ def require_samples(folder: str | Path, manifest: Manifest, count: int) -> None:
         )
 
 
-def _compatible(folder: Path, there: Manifest, wanted: Manifest) -> Manifest:
+def _require_compatible(folder: Path, there: Manifest, wanted: Manifest) -> None:
     ours, theirs = (dataclasses.asdict(m.settings) | {"seed": m.seed} for m in (wanted, there))
     for name, value in ours.items():
         if value != theirs[name]:
             raise DatasetError(
                 f"{folder} holds samples with {name} = {theirs[name]!r}, not {value!r}: choose another folder"
             )
-    return there
 
 
 def _make_shard(

@@ -176,9 +176,10 @@ class PlannerTrainer:
             self.optimizer.step()
             self.schedule.step()
             total += value * len(rows)
-            if time.perf_counter() - began > 0.2:
+            done = first + len(rows)
+            if done == len(order) or time.perf_counter() - began > 0.2:
                 began = time.perf_counter()
-                on_batch(self.epoch * len(order) + first, total / (first + len(rows)))
+                on_batch(self.epoch * len(order) + done, total / done)
         if not all(bool(weight.isfinite().all()) for weight in self.network.parameters()):
             raise self._diverged("weights not finite at the end")
         return total / len(order)

@@ -341,7 +341,7 @@ def _command(book: Book, options: str) -> str:
 
 def _versions(results: Sequence[Result]) -> str:
     """Commits with the number of results of each."""
-    names = [(r.commit or "no repository")[:7] + (" with changes" if r.dirty else "") for r in results]
+    names = [(r.commit[:7] if r.commit else "no repository") + (" with changes" if r.dirty else "") for r in results]
     return escape(", ".join(f"{name} ({count})" for name, count in Counter(names).items()))
 
 

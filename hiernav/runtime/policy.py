@@ -203,17 +203,20 @@ def make_agent(
     bundle: Bundle,
     robot_radius: float,
     goal_radius: float = GOAL_RADIUS,
-    planner: DeferredPlanner | None = None,
+    planner: Planner | DeferredPlanner | None = None,
     predict: bool = True,
+    rows: int = 1,
 ) -> HierarchicalAgent:
-    """The agent a bundle describes, for one robot: planner with verification, termination rule, skill.
+    """The agent a bundle describes: planner with verification, termination rule, skill.
 
     Args:
         bundle: verified policies.
         robot_radius: disc with which plans are swept against the map [m].
         goal_radius: distance at which the goal counts as reached [m].
-        planner: in the place of the bundle's own, such as one in a process of its own.
+        planner: in the place of the bundle's own, such as one in a process of its own. Its plans are followed as they
+            are: `VerifiedPlanner` sweeps and repairs them.
         predict: see `WaypointOption`.
+        rows: robots that are driven at once.
 
     Raises:
         BundleError: as `load_policies`.
@@ -221,7 +224,7 @@ def make_agent(
     policies, plan, replan = load_policies(bundle), bundle.manifest.plan, bundle.manifest.replan
     option = WaypointOption(
         planner or make_planner(bundle, policies.planner, robot_radius, goal_radius),
-        num_rows=1,
+        num_rows=rows,
         rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
         num_waypoints=plan.waypoints,
         goal_radius=goal_radius,

@@ -26,14 +26,15 @@ class NavigationGymEnv(gymnasium.Env):
 
     Observation: (D,) float32, raw SI units, in the order of `task.layout`. Action: (A,) float32 in [-1, 1]. An episode
     terminates at the goal or outside the field and is truncated at the world's cap on steps. `reset(seed=...)`
-    determines the worlds of all episodes that follow. `info` holds the reward terms, `reached`, `left_field`,
-    `collided`, the option's `reason`, the world's `layout_seed` and the robot's `pose`.
+    determines the worlds of all episodes that follow. `info` holds the reward terms before their weights, `reached`,
+    `left_field`, `collided`, the option's `reason`, the world's `layout_seed` and the robot's `pose`.
 
     Args:
         robot: "point", "car" or "doggo".
         world: any text that `parse_world` reads.
         planner: guides the robot; the shortest-path expert by default.
-        config: rewards, option and kind of guidance; its robot and its world are replaced by the two above.
+        config: rewards, option and kind of guidance. Its robot and its world are replaced by the two above, and
+            episodes end as evaluations do: `skill.episode_steps` and `skill.end_on_fall` are for training alone.
         render_mode: None or "rgb_array", the world from above.
     """
 

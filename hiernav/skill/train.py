@@ -42,7 +42,7 @@ _WINDOW = 200
 _EVALUATION_SEED = 0xE7A1
 _COLLISION = 0.01
 """Share of an arrival that a collision costs where actors are compared."""
-_LOGGED = tuple(("next", key) for key in ("terms", "reason", "collided"))
+_LOGGED = tuple(("next", key) for key in ("terms", "reward", "reason", "collided"))
 _ENDS = tuple(r for r in TerminationReason if r not in (TerminationReason.NONE, TerminationReason.START))
 """Why plans end in the course of an episode: its first one is made before any step."""
 
@@ -313,6 +313,7 @@ class SkillTrainer:
             "episode_steps": float(np.mean(self._episodes.steps)) if self._episodes.steps else float("nan"),
             "collisions_per_step": float(data["next", "collided"].float().mean()),
             "updates": self.learner.updates,
+            "reward_per_step": float(data["next", "reward"].mean()) / self.config.skill.reward_scale,
             **{f"reward/{name}": value for name, value in zip(TERMS, terms, strict=True)},
             **{f"replans/{r.name.lower()}": float(reasons[r] / reasons.sum()) for r in _ENDS},
             **self._new_plans(),

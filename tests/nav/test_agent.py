@@ -53,6 +53,38 @@ def test_an_agent_that_is_reset_plans_again() -> None:
     assert reasons == [START, NONE, START, NONE]
 
 
+def agent_of(rows: int) -> tuple[HierarchicalAgent, dict[str, np.ndarray]]:
+    layout = get_robot("point").observation_layout()
+    sensors = {term.name: np.zeros((rows, term.size)) for term in layout.terms}
+    return HierarchicalAgent(WaypointOption(StraightPlanner(), rows), lambda o: o[:, :2], layout, PERIOD), sensors
+
+
+def test_a_new_goal_is_planned_for_at_once_and_in_its_row_alone() -> None:
+    agent, sensors = agent_of(2)
+    pose, maps = np.zeros((2, 3)), [FREE] * 2
+    agent.act(pose, sensors, np.array([FAR, FAR]), maps)
+    step = agent.act(pose, sensors, np.array([[-2.5, 0.0], FAR]), maps)
+    assert step.reason.tolist() == [START, NONE] and step.replanned.tolist() == [True, False]
+    assert_allclose(step.plan[:, -1], [[-1.0, 0.0], [1.0, 0.0]], atol=1e-12)
+    assert agent.act(pose, sensors, np.array([[-2.5, 0.0], FAR]), maps).reason.tolist() == [NONE, NONE]
+
+
+def test_a_goal_that_creeps_is_planned_for_anew_once_it_is_elsewhere() -> None:
+    agent, sensors = agent_of(1)
+    reasons = [
+        int(agent.act(np.zeros((1, 3)), sensors, np.array([[2.0, 0.125 * k]]), [FREE]).reason[0]) for k in range(7)
+    ]
+    assert reasons == [START, NONE, NONE, START, NONE, NONE, START]  # the goal's radius is 0.3 m
+
+
+@pytest.mark.parametrize(("poses", "goals", "maps"), [(3, 2, 2), (2, 1, 2), (2, 2, 1)])
+def test_rows_that_the_agent_was_not_made_for_are_refused(poses: int, goals: int, maps: int) -> None:
+    agent, sensors = agent_of(2)
+    told = rf"poses \({poses}, 3\), goals \({goals}, 2\) and {maps} maps, expected \(2, 3\), \(2, 2\) and 2"
+    with pytest.raises(ValueError, match=told):
+        agent.act(np.zeros((poses, 3)), sensors, np.zeros((goals, 2)), [FREE] * maps)
+
+
 def test_a_robot_that_stands_still_sees_less_of_what_holds_it_until_it_is_reset() -> None:
     layout = get_robot("point").observation_layout()
     sensors = {term.name: np.zeros((1, term.size)) for term in layout.terms} | {"lidar": np.full((1, 10), 0.5)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -133,6 +134,84 @@ def test_a_data_set_that_was_stopped_at_its_first_shard_is_begun_again(tmp_path:
     assert write_dataset(tmp_path / "data", SETTINGS, 8, SEED).finished
 
 
+def stopped_once_shard_is_written(number: int):
+    """In the place of `_make_shard`: the process ends before the manifest names the shard."""
+    make_shard = store._make_shard
+
+    def stopped(*task):
+        shard = make_shard(*task)
+        if task[3] == number:
+            raise KeyboardInterrupt
+        return shard
+
+    return stopped
+
+
+def test_shards_that_no_manifest_names_yet_keep_nobody_from_going_on(tmp_path: Path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(store, "_make_shard", stopped_once_shard_is_written(0))
+        write_dataset(tmp_path / "data", SETTINGS, 8, SEED)
+    other = replace(SETTINGS, radius=0.12)  # none of them is there, so any kind may be made
+    for settings in (other, SETTINGS):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(store, "_make_shard", stopped_once_shard_is_written(0))
+            write_dataset(tmp_path / "data", settings, 8, SEED)
+    assert write_dataset(tmp_path / "data", SETTINGS, 8, SEED).finished
+    assert same(read_dataset(tmp_path / "data"), make_samples(SETTINGS, 8, SEED))
+
+
+def test_a_data_set_whose_enlarging_was_stopped_is_unfinished_and_not_altered(tmp_path: Path, monkeypatch):
+    folder = tmp_path / "data"
+    write_dataset(folder, SETTINGS, 12, SEED)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(store, "_make_shard", stopped_once_shard_is_written(1))
+        write_dataset(folder, SETTINGS, 16, SEED)
+    with pytest.raises(DatasetError, match=r"has 8 samples, 12 are wanted: let `hiernav dataset` go on"):
+        read_dataset(folder, 12)
+    write_dataset(folder, SETTINGS, 12, SEED)
+    assert same(read_dataset(folder), make_samples(SETTINGS, 12, SEED))
+
+
+def test_a_crash_while_a_file_is_replaced_leaves_the_old_one(folder: Path, monkeypatch):
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+
+    def crash(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("os.replace", crash)
+        write_dataset(folder, SETTINGS, 30, SEED)
+    assert before.items() <= {file.name: file.read_bytes() for file in folder.iterdir()}.items()
+    assert len(read_dataset(folder)) == 20
+
+
+def test_what_another_process_made_just_before_is_not_made_again(folder: Path, monkeypatch):
+    acquire = store.FolderLock.acquire
+
+    def late(lock: store.FolderLock) -> bool:
+        with monkeypatch.context() as patch:
+            patch.setattr(store.FolderLock, "acquire", acquire)
+            write_dataset(folder, SETTINGS, 24, SEED)
+        return acquire(lock)
+
+    monkeypatch.setattr(store.FolderLock, "acquire", late)
+    reported: list[int] = []
+    write_dataset(folder, SETTINGS, 28, SEED, on_progress=reported.append)
+    assert reported == [24, 28]
+
+
+def test_shards_are_made_in_as_many_processes_as_are_asked_for(tmp_path: Path, monkeypatch):
+    asked: list[int] = []
+
+    def here(function, tasks, processes):
+        asked.append(processes)
+        return (function(*task) for task in tasks)
+
+    monkeypatch.setattr(store, "map_tasks", here)
+    write_dataset(tmp_path / "data", SETTINGS, 4, SEED, processes=3)
+    assert asked == [3]
+
+
 def test_samples_of_another_kind_are_not_mixed_in(folder: Path):
     with pytest.raises(DatasetError, match=r"radius = 0.1, not 0.2: choose another folder"):
         write_dataset(folder, replace(SETTINGS, radius=0.2), 20, SEED)
@@ -143,6 +222,9 @@ def test_samples_of_another_kind_are_not_mixed_in(folder: Path):
     (other / "thesis.txt").write_text("mine")
     with pytest.raises(DatasetError, match="not a data set and not empty"):
         write_dataset(other, SETTINGS, 20, SEED)
+    assert [file.name for file in other.iterdir()] == ["thesis.txt"]
+    with pytest.raises(DatasetError, match="not a data set and not empty"):
+        write_dataset(other / "thesis.txt", SETTINGS, 20, SEED)
 
 
 def altered(file: Path) -> None:
@@ -170,6 +252,30 @@ def test_what_is_altered_or_missing_is_not_learnt_from(folder: Path, damage, nam
     with pytest.raises(DatasetError) as error:
         read_dataset(folder)
     assert named in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda arrays: {**arrays, "label": arrays["label"][:, :9]}, r"label is float32 \(8, 9, 2\), expected "),
+        (lambda arrays: {**arrays, "distance": arrays["distance"][:7]}, r"distance is float32 \(7,\), expected "),
+        (lambda arrays: {**arrays, "image": arrays["image"].astype(np.int16)}, "image is int16 .*, expected uint8 "),
+        (lambda arrays: {**arrays, "label": arrays["label"] * np.float32("nan")}, "label is not finite everywhere"),
+        (lambda arrays: {name: arrays[name] for name in ("image", "label")}, "distance"),
+        (lambda arrays: None, "shard-00001.npz: "),
+    ],
+    ids=["waypoints", "rows", "type", "nan", "part", "no archive"],
+)
+def test_a_shard_that_is_no_set_of_such_samples_is_named_though_its_hash_is_right(folder: Path, change, named: str):
+    file = folder / "shard-00001.npz"
+    with np.load(file) as arrays:
+        changed = change(dict(arrays))
+    file.write_bytes(b"PK, and no more") if changed is None else np.savez(file, **changed)
+    manifest = json.loads((folder / "dataset.json").read_text())
+    manifest["shards"][1]["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    (folder / "dataset.json").write_text(json.dumps(manifest))
+    with pytest.raises(DatasetError, match=named):
+        read_dataset(folder)
 
 
 def test_the_command_makes_goes_on_checks_and_draws(tmp_path: Path, capsys):

@@ -19,10 +19,25 @@ from hiernav import cli
 from hiernav.config import load_config
 from hiernav.evaluate import wilson_interval
 from hiernav.film.film import film_name
+from hiernav.report import figures, paper, tables
 from hiernav.report import findings as told
-from hiernav.report import paper, tables
+from hiernav.report import page as report_page
 from hiernav.report.book import Book, Group, of_seeds
-from hiernav.report.page import FILM_LIMIT, _ablations, _film, _provenance, _replanning, render, write_report
+from hiernav.report.page import (
+    FILM_LIMIT,
+    _ablations,
+    _by_robot,
+    _command,
+    _film,
+    _films,
+    _gallery,
+    _provenance,
+    _replanning,
+    _strict,
+    _targets,
+    render,
+    write_report,
+)
 from hiernav.reproduce.cells import Places, cell_key
 from hiernav.reproduce.experiments import ROBOTS, TABLE3_ROBOT, UNSEEN, WORLDS
 from hiernav.reproduce.results import read_result, result_path, write_result
@@ -679,3 +694,77 @@ def test_the_page_is_written_whole(tmp_path):
     assert text.startswith("<!doctype html>") and text.endswith("</html>\n")
     assert len(book.results) == 6
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_each_target_is_said_to_be_met_missed_or_open(monkeypatch):
+    judged = [told.Finding("a < b", True, "1 < 2"), told.Finding("b", False, "late"), told.Finding("c", None, "soon")]
+    monkeypatch.setattr(report_page, "findings", lambda _: judged)
+    items = re.findall(r"<li>.*?</li>", _targets(book_of()))
+    assert [" ".join(text_of(item).split()) for item in items] == ["met a < b 1 < 2", "missed b late", "open c soon"]
+    assert [re.findall(r'class="(\w+)"', item) for item in items] == [["met"], ["short"], ["none"]]
+
+
+def test_the_worlds_in_which_a_shipped_robot_falls_short_stand_below_its_numbers(monkeypatch):
+    monkeypatch.setattr(figures, "reach", lambda *_: None)
+    half = {"reach_rate": 0.5, "endings": {"goal": 500, "timeout": 500}}
+    drive = made_up.drive(np.random.default_rng(0), 1000) | half
+    results = [
+        made_up.result_of(made_up.CELLS[f"table3/{robot}-shipped-gremlin"], metrics={"strict": {**drive, **changes}})
+        for robot, changes in (("car", {}), ("point", {"reach_rate": told.STRICT_TARGET}))
+    ]
+    shown = text_of(_strict(book_of(*results)))
+    assert re.findall(r"Where the shipped (\w+) falls short of 0.97:", shown) == ["car"]
+    assert "gremlin: 500 of 1000 episodes fail, 500 by reaching the cap on steps." in shown
+
+
+def test_a_film_tells_how_many_episodes_reached_the_goal_and_a_failed_one_its_error():
+    cells = [made_up.CELLS[f"films/point-{world}"] for world in ("gremlin", "two-room")]
+    assert cells[0].settings["episodes"] != 2
+    done, failed = made_up.result_of(cells[0]), made_up.result_of(cells[1], **{**FAILURE, "error": "no codec <h264>"})
+    shown = text_of(_films(replace(book_of(done, failed), changed={done.id: "older bundle"}), Path()))
+    assert f"point, gremlin: 2 of {cells[0].settings['episodes']} reached the goal (older bundle)" in shown
+    assert "failed: no codec <h264> point, two-room" in " ".join(shown.split())
+
+
+def test_done_failed_and_the_hours_of_both_are_counted_for_an_experiment():
+    results = trained("point", "ours", 0, seconds=5400.0), trained("point", "ours", 1, seconds=1800.0, **FAILURE)
+    assert rows(_provenance(book_of(*results)))["sample_efficiency"] == ["1", "1", "?", "2.00 h"]
+
+
+def test_a_section_names_the_versions_of_the_code_that_made_it_and_no_others():
+    results = [
+        trained("point", "ours", 0, commit="0123456789abcdef", dirty=False),
+        trained("point", "ours", 1, commit="0123456789abcdef", dirty=True),
+        trained("point", "ours", 2, commit="0123456789abcdef", dirty=True),
+        trained("point", "ours", 3, commit=None, dirty=None),
+        made_up.result_of(made_up.CELLS["films/point-gremlin"], commit="fedcba9876543210"),
+    ]
+    told_of = text_of(_command(book_of(*results), "--only sample_efficiency"))
+    assert "Made by 0123456 (1), 0123456 with changes (2), no repository (1)." in told_of
+    assert "fedcba9" not in told_of
+
+
+def test_a_robot_or_figure_that_was_not_run_is_named():
+    shown = {"doggo": "1.0", "car": tables.NOT_RUN}
+    tables_of = {robot: tables.table(["x"], [["a", cell]], "y") for robot, cell in shown.items()}
+    told_of = " ".join(text_of(_by_robot(lambda robot: tables_of.get(robot, ""))).split())
+    assert "car: not run yet" in told_of and "1.0" in told_of and "point" not in told_of
+    gallery = _gallery([("<svg/>", "the doggo"), (None, "the car"), (None, "a <b>")])
+    assert "not run yet: the car; a <b>" in text_of(gallery)
+
+
+def test_a_page_that_cannot_be_replaced_stays_as_it_was(tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    out = tmp_path / "report.html"
+    out.write_text("the page of before")
+
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(report_page, "render", lambda *_: "the page of now")
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space left"):
+        patch.setattr("os.replace", full)
+        write_report(tmp_path / "results", out)
+    assert out.read_text() == "the page of before"
+    write_report(tmp_path / "results", out)
+    assert out.read_text() == "the page of now"

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from hiernav.evaluate import evaluate, open_policies
-from hiernav.reproduce import queue, work
+from hiernav.reproduce import child, queue, work
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.child import CellFailed, run_in_process
 from hiernav.reproduce.experiments import SMOKE, catalogue
@@ -183,10 +183,13 @@ def test_an_error_in_a_cells_process_is_its_failure(places):
         experiment="astar", name="a", kind="evaluate", robot="point", variant="astar", seconds=1.0,
         world="gremlin", bundle="deploy/bundles/nothing", settings={"episodes": 1},
     )  # fmt: skip
-    with pytest.raises(CellFailed, match="deploy/bundles/nothing"):
-        run_in_process(cell, places, lambda *_: None, (None, None))
     log = places.runs / "logs" / "astar-a.log"
-    assert "Traceback" in log.read_text()
+    log.parent.mkdir(parents=True)
+    log.write_text("what it printed before\n")
+    with pytest.raises(CellFailed, match=r"^\w+: [^\n]*deploy/bundles/nothing[^\n]* \((?!child)\w+\.py:\d+\)$"):
+        run_in_process(cell, places, lambda *_: None, (None, None))
+    printed = log.read_text()
+    assert printed.startswith("what it printed before\n") and "Traceback" in printed
 
 
 def test_a_process_that_dies_is_a_failure_that_names_the_signal(places):
@@ -195,11 +198,50 @@ def test_a_process_that_dies_is_a_failure_that_names_the_signal(places):
     def kill(share: float, what: str) -> None:
         import multiprocessing
 
-        (child,) = multiprocessing.active_children()
-        child.kill()
+        (process,) = multiprocessing.active_children()
+        process.kill()
 
-    with pytest.raises(CellFailed, match="SIGKILL"):
+    with pytest.raises(CellFailed, match="SIGKILL, perhaps for want of memory; what it printed is in .*[.]log$"):
         run_in_process(cell, places, kill, (None, None))
+
+
+def test_a_process_that_exits_by_itself_is_a_failure_that_names_its_code(places):
+    log = places.runs / "logs" / "astar-a.log"
+    assert child._death(3, log) == f"its process ended with code 3; what it printed is in {log}"
+    assert child._death(-signal.SIGSEGV, log).startswith("its process was ended by SIGSEGV; what it printed")
+
+
+WORK_OF_A_QUEUE = """
+import multiprocessing
+import threading
+
+from hiernav.reproduce.child import _end_with_parent
+
+FOREVER = threading.Event()
+
+
+def work(told):
+    _end_with_parent()
+    with open(told, "w") as file:
+        print("at work", file=file, flush=True)
+        FOREVER.wait(20.0)
+        print("still at work", file=file)
+
+
+if __name__ == "__main__":
+    multiprocessing.get_context("forkserver").Process(target=work, args=(TOLD,)).start()
+    FOREVER.wait()
+"""
+
+
+def test_a_queue_that_is_killed_leaves_no_process_at_work(tmp_path):
+    told, script = tmp_path / "told", tmp_path / "script.py"
+    os.mkfifo(told)
+    script.write_text(f"TOLD = {str(told)!r}\n{WORK_OF_A_QUEUE}")
+    with subprocess.Popen([sys.executable, str(script)]) as parent, told.open() as read:
+        assert read.readline() == "at work\n"
+        parent.kill()
+        assert read.read() == ""
 
 
 def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result(tmp_path):

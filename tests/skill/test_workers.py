@@ -15,6 +15,7 @@ pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
 from tensordict import TensorDict  # noqa: E402
 
+from hiernav.nav.planners import StraightPlanner  # noqa: E402
 from hiernav.run import WorkersLost  # noqa: E402
 from hiernav.skill import workers  # noqa: E402
 from hiernav.skill.env import PhysicsDiverged  # noqa: E402
@@ -32,6 +33,7 @@ class Scripted:
         self.lives, self.error = list(lives), error or RuntimeError("gone\nand more")
         self.random_frames: list[int] = []
         self.stopped, self.closed = 0, 0
+        self.failure: Exception | None = None
 
     def start(self, random_frames: int) -> ScriptedCollector:
         self.random_frames.append(random_frames)
@@ -52,6 +54,8 @@ class ScriptedCollector:
             self.place = arguments[0][1]
         elif method == "load":
             self.weight = float(arguments[0][0]["weight"])
+        elif method == "check" and self.machines.failure is not None:
+            raise self.machines.failure
 
     def __iter__(self) -> Iterator[TensorDict]:
         while self.shares is None or self.shares > 0:
@@ -62,6 +66,35 @@ class ScriptedCollector:
 
     def shutdown(self) -> None:
         self.machines.stopped += 1
+
+
+class OneSlow(Scripted):
+    """Machines on which the worker started last is in the middle of its second share until `end`, and dies then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.end = threading.Event()
+        self.busy, self.stopped_while_busy = False, False
+
+    def start(self, random_frames: int) -> ScriptedCollector:
+        self.random_frames.append(random_frames)
+        return (SlowCollector if len(self.random_frames) == 2 else ScriptedCollector)(self, None)
+
+
+class SlowCollector(ScriptedCollector):
+    machines: OneSlow
+
+    def __iter__(self) -> Iterator[TensorDict]:
+        yield next(super().__iter__())
+        self.machines.busy = True
+        self.machines.end.wait(60.0)
+        self.machines.busy = False
+        raise self.machines.error
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.machines.stopped_while_busy |= self.machines.busy
+        self.machines.end.set()
 
 
 class OneWeight(torch.nn.Module):
@@ -136,6 +169,16 @@ def test_an_error_that_is_no_death_reaches_the_trainer(config, error) -> None:
     assert len(machines.random_frames) == 1
 
 
+def test_a_share_in_which_physics_broke_is_not_delivered(config) -> None:
+    machines = Scripted()
+    worker = Worker(0, config, machines)
+    worker.collect(order())
+    machines.failure = PhysicsDiverged("simulation 3 is not finite")
+    with pytest.raises(PhysicsDiverged, match="simulation 3"):
+        worker.collect(order())
+    assert len(machines.random_frames) == 1
+
+
 @pytest.mark.parametrize(("overlap", "acted_by"), [("false", [0, 1, 2]), ("true", [0, 0, 1])])
 def test_a_batch_holds_all_shares_in_order_collected_by_the_weights_of_its_time(
     config, monkeypatch, tmp_path, overlap, acted_by
@@ -155,6 +198,38 @@ def test_a_batch_holds_all_shares_in_order_collected_by_the_weights_of_its_time(
     assert found == [[(512, 0, 0), (512, 1, 0)]] * 2 + [[(512, 0, 0), (512, 1, 1)]]
     assert weights == [[float(weight)] * 2 for weight in acted_by]
     assert machines.stopped == 3 and machines.closed == 1
+
+
+def test_workers_share_what_is_left_of_the_random_actions_and_plan_as_the_trainer_says(monkeypatch, tmp_path) -> None:
+    machines, asked, planner = Scripted(1, 1), [], StraightPlanner()
+    monkeypatch.setattr(workers, "find_machines", lambda *given: asked.append(given) or machines)
+    config = tiny_run.config(tmp_path, "skill.workers=2", "skill.collector=multi", "skill.learning_starts=600")
+    batches = WorkerBatches(config, OneWeight(), planner)
+    assert (batches.share, batches.frames) == (128, 256)
+    assert len(list(batches.segment(0, 512))) == 2
+    batches.close()
+    assert asked == [(config, 128, planner)]
+    assert machines.random_frames == [3 * 128] * 2 + [2 * 128] * 2, "successors act at random for one batch less"
+
+
+def test_no_worker_is_stopped_in_the_middle_of_its_share_and_none_is_replaced_after_the_end(
+    monkeypatch, tmp_path
+) -> None:
+    machines = OneSlow()
+
+    def wait(shares: list) -> None:
+        machines.end.set()
+        wait_for(shares)
+
+    wait_for = workers.wait
+    monkeypatch.setattr(workers, "wait", wait)
+    monkeypatch.setattr(workers, "find_machines", lambda *_: machines)
+    config = tiny_run.config(tmp_path, "skill.workers=2", "skill.collector=multi", "skill.overlap=true")
+    batches = WorkerBatches(config, OneWeight())
+    next(batches.segment(0, 3 * batches.frames))
+    batches.close()
+    assert not machines.stopped_while_busy
+    assert (len(machines.random_frames), machines.stopped, machines.closed) == (2, 2, 1)
 
 
 @pytest.mark.parametrize(
