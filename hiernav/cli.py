@@ -265,7 +265,9 @@ def _parser() -> argparse.ArgumentParser:
     world = commands.add_parser(
         "world", help="draw a world", description="Sample a world from a seed and draw it, or print it as JSON."
     )
-    world.add_argument("--kind", default="pillar(2,2,10)", metavar="WORLD", help="which world (pillar(2,2,10))")
+    world.add_argument(
+        "--kind", "--world", default="pillar(2,2,10)", metavar="WORLD", help="which world (pillar(2,2,10))"
+    )
     world.add_argument("--seed", type=int, default=0, help="decides the layout (0)")
     world.add_argument("--radius", type=float, default=0.1, help="of the robot it must be solvable for [m] (0.1)")
     world.add_argument("--png", metavar="FILE", help="picture to write")

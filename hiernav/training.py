@@ -6,6 +6,7 @@ import math
 import time
 
 import torch
+from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from hiernav.nav.option import Planner
@@ -19,8 +20,13 @@ from hiernav.skill import train as skill_train
 _LINE_SECONDS = 30.0
 
 
-def train(run: Run, stage: str, progress: Progress) -> None:
+def train(run: Run, stage: str = "all", progress: Progress | None = None) -> None:
     """Train "planner", "skill" or "all" of a run, from its last checkpoints on.
+
+    Args:
+        run: to train into; `Run.create` begins one, `Run.open` goes on with one.
+        stage: what to train.
+        progress: to show how far it is; None: it is silent.
 
     Raises:
         KeyboardInterrupt: somebody pressed Ctrl-C, whatever a library that was interrupted made of it.
@@ -29,7 +35,7 @@ def train(run: Run, stage: str, progress: Progress) -> None:
         ConfigError: see `hiernav.run.check_stage`.
     """
     try:
-        _train(run, stage, progress)
+        _train(run, stage, progress or Progress(disable=True, console=Console(quiet=True)))
     except Exception as error:
         # what tensordict does in the middle of its bookkeeping fails otherwise where it is interrupted
         cause: BaseException | None = error
