@@ -111,9 +111,8 @@ def redraws(book: Book) -> str:
         again = [f"{count} in {world}" for world, count in counts.items() if count]
         if counts:
             parts.append(f"{robot} {', '.join(again) or 'none'}")
-    return (
-        f"Layouts that no way leads through for the robot are drawn again; for 1000 of each world: {'; '.join(parts)}."
-    )
+    told = f"so many among the layouts of the strict protocol: {'; '.join(parts)}" if parts else "none was driven yet"
+    return f"Layouts that no way leads through for the robot are drawn again; {told}."
 
 
 def table2(book: Book) -> str:
