@@ -296,18 +296,16 @@ def _train(arguments: argparse.Namespace) -> int:
 
     flags = {"skill.collector": arguments.collector, "skill.workers": arguments.workers}
     flags["skill.ray_address"] = arguments.ray_address
-    overrides = [f"{key}={value}" for key, value in flags.items() if value is not None] + arguments.overrides
-    if arguments.worlds:
-        trained = ("planner", "skill") if arguments.stage == "all" else (arguments.stage,)
-        overrides += [f"{stage}.worlds={json.dumps(arguments.worlds)}" for stage in trained]
+    stages = ("planner", "skill") if arguments.stage == "all" else (arguments.stage,)
+    overrides = [f"{key}={value}" for key, value in flags.items() if value is not None]
+    overrides += _worlds_of_stages(arguments, stages) + arguments.overrides
     if arguments.source:
         if arguments.stage != "planner" or arguments.config or arguments.resume:
             raise RunError("--from fine-tunes the planner: use it with --stage planner, without --config and --resume")
         from hiernav.finetune import begin_fine_tuning, fine_tuning_config
 
         config = fine_tuning_config(arguments.source, overrides)
-        _check_training(config, arguments.stage)
-        run = begin_fine_tuning(_with_worlds_of_data(config, overrides), arguments.source)
+        run = begin_fine_tuning(_check_training(config, arguments.stage, overrides), arguments.source)
     elif arguments.resume:
         if arguments.config or overrides:
             raise RunError(
@@ -318,8 +316,7 @@ def _train(arguments: argparse.Namespace) -> int:
     else:
         config = load_config(arguments.config, overrides)
         _check_collector(config, overrides)
-        _check_training(config, arguments.stage)
-        run = Run.create(_with_worlds_of_data(config, overrides))
+        run = Run.create(_check_training(config, arguments.stage, overrides))
     from hiernav.training import train
 
     print(f"run folder: {run.path}")
@@ -328,7 +325,7 @@ def _train(arguments: argparse.Namespace) -> int:
             train(run, arguments.stage, progress)
     except KeyboardInterrupt as error:
         again = f"hiernav train --resume {run.path}" + (arguments.stage != "all") * f" --stage {arguments.stage}"
-        saved = any(run.has(stage) for stage in ("planner", "skill"))
+        saved = any(run.has(stage) for stage in stages)
         where = "go on from the last checkpoint" if saved else "there is no checkpoint yet, begin it again"
         print(f"stopped; {where} with: {again}", file=sys.stderr)
         return _interruption(error)
@@ -342,6 +339,26 @@ def _train(arguments: argparse.Namespace) -> int:
     else:
         print(f"done; export with: hiernav export --run {run.path} --onnx")
     return 0
+
+
+def _worlds_of_stages(arguments: argparse.Namespace, stages: Sequence[str]) -> list[str]:
+    """What `train --worlds` sets; a setting that is spelled out on the command line goes before.
+
+    Raises:
+        ValueError: the skill would be trained in what is no world, but a mix.
+    """
+    from hiernav.sim.layout import parse_world
+
+    worlds = arguments.worlds or []
+    spelled = {text.partition("=")[0] for text in arguments.overrides}
+    for world in worlds if "skill" in stages and "skill.worlds" not in spelled else ():
+        try:
+            parse_world(world)
+        except ValueError as error:
+            raise ValueError(
+                f"--worlds {world}: {error}; a mix is for the planner alone: say skill.worlds=[...] too"
+            ) from None
+    return [f"{stage}.worlds={json.dumps(worlds)}" for stage in stages if worlds]
 
 
 def _worlds(arguments: argparse.Namespace) -> list[WorldSpec]:
@@ -624,32 +641,13 @@ def _config(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_training(config: TrainConfig, stage: str) -> None:
-    """Refuse what cannot be trained, or not on this machine, before a run folder is made."""
+def _check_training(config: TrainConfig, stage: str, overrides: Sequence[str]) -> TrainConfig:
+    """Refuse what cannot be trained, or not on this machine, before a run folder is made; what will be trained."""
     check_stage(config, stage)
     _check_worlds(config)
     _check_scene(config)
     _check_machine(config)
-    _check_data(config)
-
-
-def _with_worlds_of_data(config: TrainConfig, overrides: list[str]) -> TrainConfig:
-    """A planner that learns from a data set learns the worlds of that."""
-    from hiernav.config import ConfigError
-
-    if config.planner.data is None or config.skill.preset == "baseline":
-        return config
-    import msgspec
-
-    from hiernav.planner.train import settings_of_data
-
-    worlds = settings_of_data(config).worlds
-    if any(text.startswith("planner.worlds=") for text in overrides) and config.planner.worlds != worlds:
-        raise ConfigError(
-            f"planner.worlds = {list(config.planner.worlds)}, but planner.data = {config.planner.data!r} "
-            f"was made in {list(worlds)}: leave one of them out"
-        )
-    return msgspec.structs.replace(config, planner=msgspec.structs.replace(config.planner, worlds=worlds))
+    return _with_worlds_of_data(config, overrides)
 
 
 def _check_collector(config: TrainConfig, overrides: list[str]) -> None:
@@ -715,12 +713,25 @@ def _check_machine(config: TrainConfig) -> None:
         import ray  # noqa: F401
 
 
-def _check_data(config: TrainConfig) -> None:
-    """Refuse a data set that is not there or that this run cannot learn from, before a run folder is made."""
-    if config.planner.data is not None and config.skill.preset != "baseline":  # which has no planner
-        from hiernav.planner.train import settings_of_data
+def _with_worlds_of_data(config: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
+    """The configuration with the worlds that its planner's data set was made in.
 
-        settings_of_data(config)
+    Refuses a data set that is not there or that this run cannot learn from, and other worlds on the command line; those
+    of a file give way.
+    """
+    from hiernav.config import ConfigError
+
+    if config.planner.data is None or config.skill.preset == "baseline":  # which has no planner
+        return config
+    from hiernav.planner.train import with_worlds_of_data
+
+    found = with_worlds_of_data(config)
+    if found != config and any(text.startswith("planner.worlds=") for text in overrides):
+        raise ConfigError(
+            f"planner.worlds = {list(config.planner.worlds)}, but planner.data = {config.planner.data!r} "
+            f"was made in {list(found.planner.worlds)}: leave one of them out"
+        )
+    return found
 
 
 def _print_results(results: dict[str, dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ import functools
 import json
 import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
@@ -99,7 +100,7 @@ def decode(kind: type[S], values: Any, source: str | Callable[[str], str]) -> S:
             raise ConfigError(f"{origin(path)}: {error}") from None
         raise ConfigError(
             f"{origin(path)}: {path} = {_value_at(values, path)!r}, expected {fields[path].help.type}"
-            f"{_way_to_write(_value_at(values, path), fields[path].help.type)}"
+            f"{_way_to_write(path, _value_at(values, path), fields[path].help.type)}"
         ) from None
 
 
@@ -179,14 +180,17 @@ def _leaves(values: Any, fields: dict[str, _Field], prefix: str = "") -> Iterato
             yield from _leaves(value, fields, path + ".")
 
 
-def _way_to_write(value: Any, wanted: str) -> str:
-    """How a value of nearly the wanted type is written."""
+def _way_to_write(path: str, value: Any, wanted: str) -> str:
+    """How a value of nearly the wanted type is written, as an argument in a shell."""
     if isinstance(value, str) and "list of" in wanted:
-        numbers = re.fullmatch(r"[-+.\d]+(,[-+.\d]+)*", value.replace(" ", ""))
-        return f": write [{value}]" if numbers else f": write {as_text([value])}"
-    if isinstance(value, float) and wanted.startswith("int") and value.is_integer():
-        return f": write {int(value)}"
-    return ""
+        entries = re.split(r",\s*(?![^()]*\))", value)
+        numbers = all(re.fullmatch(r"[-+.\d]+", entry) for entry in entries)
+        right = f"[{', '.join(entries)}]" if numbers else as_text(entries)
+    elif isinstance(value, float) and wanted.startswith("int") and value.is_integer():
+        right = str(int(value))
+    else:
+        return ""
+    return f"; write {shlex.quote(f'{path}={right}')}"
 
 
 def _value_at(values: Any, path: str) -> Any:

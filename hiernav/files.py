@@ -18,8 +18,13 @@ def write_json(path: Path, value: Any) -> None:
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that readers and crashes see the old or the new one, never half of it.
 
-    Once this has returned it is the new one, after a power failure too.
+    Once this has returned it is the new one, after a power failure too. A link stays one, and a device or a pipe is
+    written to as it is.
     """
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        path.write_bytes(data)
+        return
     temporary = path.with_name(path.name + ".part")
     try:
         with temporary.open("wb") as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from without_torch import BLOCK
 from hiernav import cli
 from hiernav.config import describe_config, load_config
 from hiernav.evaluate import wilson_interval
+from hiernav.nav.bundle import file_sha256, load_bundle
 
 COMMANDS = ("train", "evaluate", "watch", "export", "report", "world", "config")
 
@@ -504,7 +506,7 @@ def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
 
 def test_a_baseline_has_no_use_for_a_data_set():
     config = load_config(None, ["skill.preset=baseline", "planner.data=nowhere"])
-    cli._check_data(config)
+    assert cli._with_worlds_of_data(config, []) is config
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
@@ -523,17 +525,30 @@ def await_file(file: Path, process: subprocess.Popen[str], timeout: float = 120.
         time.sleep(0.01)
 
 
+WORLDLESS = [text for text in tiny_run.SETTINGS if ".worlds=" not in text]
+
+
 @pytest.mark.train
 @pytest.mark.parametrize(
-    ("stage", "planner", "skill"),
-    [("planner", "two-room", tiny_run.WORLD), ("skill", tiny_run.WORLD, "two-room"), ("all", "two-room", "two-room")],
+    ("stage", "trained"), [("planner", {"planner"}), ("skill", {"skill"}), ("all", {"planner", "skill"})]
 )
-def test_worlds_on_the_command_line_are_those_of_what_is_trained(tmp_path, monkeypatch, stage, planner, skill):
+def test_worlds_on_the_command_line_are_those_of_what_is_trained(tmp_path, monkeypatch, stage, trained):
     monkeypatch.setattr("hiernav.training.train", lambda *_: None)
-    settings = tiny_run.arguments(tmp_path / "run")
-    assert cli.main(["train", "--stage", stage, "--worlds", "two-room", *settings]) == 0
+    run = tmp_path / "run"
+    assert cli.main(["train", "--stage", stage, "--worlds", "two-room", *WORLDLESS, f"run_dir={run}"]) == 0
+    config, default = load_config(run / "config.yaml"), load_config()
+    assert config.planner.worlds == (("two-room",) if "planner" in trained else default.planner.worlds)
+    assert config.skill.worlds == (("two-room",) if "skill" in trained else default.skill.worlds)
+
+
+@pytest.mark.train
+def test_a_mix_of_worlds_is_for_the_planner_and_what_is_spelled_out_goes_before(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("hiernav.training.train", lambda *_: None)
+    mix = ["train", "--worlds", "2*two-room(2..4,2..4)", *WORLDLESS]
+    assert "a mix is for the planner alone: say skill.worlds=[...] too" in refused(*mix)
+    assert cli.main([*mix, "skill.worlds=['gremlin']", "run_dir=run"]) == 0
     config = load_config(tmp_path / "run" / "config.yaml")
-    assert (config.planner.worlds, config.skill.worlds) == ((planner,), (skill,))
+    assert (config.planner.worlds, config.skill.worlds) == (("2*two-room(2..4,2..4)",), ("gremlin",))
 
 
 @pytest.mark.train
@@ -550,19 +565,36 @@ def test_a_planner_that_learns_from_a_data_set_says_so_with_the_worlds_of_that(r
 
 
 @pytest.mark.train
-def test_a_stage_says_what_to_do_after_it_and_that_it_is_finished(tmp_path, capsys):
-    settings = tiny_run.arguments(tmp_path / "run", "skill.total_steps=512", "skill.eval_every_steps=512")
-    assert cli.main(["train", "--stage", "planner", *settings]) == 0
-    again = f"hiernav train --resume {tmp_path / 'run'} --stage"
-    assert capsys.readouterr().out.endswith(f"done; train the skill with: {again} skill\n")
-    assert cli.main(again.split()[1:] + ["planner"]) == 0
-    assert "planner: finished already" in capsys.readouterr().err
-    assert cli.main(again.split()[1:] + ["skill"]) == 0
-    assert capsys.readouterr().out.endswith(f"done; export with: hiernav export --run {tmp_path / 'run'} --onnx\n")
-    assert cli.main(again.split()[1:] + ["all"]) == 0
-    assert "skill: finished already; to train for longer, begin a new run" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("stage", "made", "end"),
+    [
+        ("planner", ["planner"], "done; train the skill with: hiernav train --resume {run} --stage skill"),
+        ("skill", ["skill"], "done; train the planner with: hiernav train --resume {run} --stage planner"),
+        ("all", ["planner", "skill"], "done; export with: hiernav export --run {run} --onnx"),
+    ],
+)
+def test_a_training_ends_with_what_to_do_next(tmp_path, capsys, monkeypatch, stage, made, end):
+    run = tmp_path / "run"
+
+    def trained(*_: object) -> None:
+        for name in made:
+            (run / name).mkdir()
+            (run / name / "checkpoint.pt").touch()
+
+    monkeypatch.setattr("hiernav.training.train", trained)
+    assert cli.main(["train", "--stage", stage, *tiny_run.arguments(run)]) == 0
+    assert capsys.readouterr().out.endswith(end.format(run=run) + "\n")
 
 
+@pytest.mark.train
+def test_stages_that_are_finished_are_not_trained_on_and_say_so(trained_run, capsys):
+    for stage, also in (("planner", "skill"), ("skill", "planner")):
+        assert cli.main(["train", "--resume", str(trained_run), "--stage", stage]) == 0
+        told = capsys.readouterr().err
+        assert f"{stage}: finished already; to train for longer, begin a new run" in told and also not in told
+
+
+@pytest.mark.train
 def test_a_training_that_is_stopped_before_its_first_checkpoint_says_that_it_begins_again(
     tmp_path, capsys, monkeypatch
 ):
@@ -588,17 +620,20 @@ def test_defaults_are_listed_as_they_are_written(capsys):
 
 
 @pytest.mark.parametrize(
-    ("given", "hint"),
+    ("given", "right"),
     [
-        ("planner.worlds=two-room", 'write ["two-room"]'),
-        ("planner.worlds='pillar(2,2,10)'", 'write ["pillar(2,2,10)"]'),
-        ("skill.hidden=128,128", "write [128,128]"),
-        ("skill.total_steps=1e5", "write 100000"),
+        ("planner.worlds=two-room", ["two-room"]),
+        ("planner.worlds='pillar(2,2,10)'", ["pillar(2,2,10)"]),
+        ("planner.worlds=two-room,pillar(2,2,10)", ["two-room", "pillar(2,2,10)"]),
+        ("skill.hidden=128,128", [128, 128]),
+        ("skill.total_steps=1e5", 100_000),
     ],
 )
-def test_a_value_of_nearly_the_right_type_is_told_how_it_is_written(refused, given, hint):
-    assert refused("config", given).endswith(f": {hint}\n")
-    load_config(None, [f"{given.partition('=')[0]}={hint.removeprefix('write ')}"])
+def test_a_value_of_nearly_the_right_type_is_told_how_it_is_written_in_a_shell(refused, given, right):
+    (hint,) = shlex.split(refused("config", given).partition("; write ")[2])
+    (section, _, key), value = hint.partition("=")[0].partition("."), right
+    found = getattr(getattr(load_config(None, [hint]), section), key)
+    assert (list(found) if isinstance(right, list) else found) == value
 
 
 def test_an_unknown_option_is_told_with_the_options_of_its_command(capsys):
@@ -616,4 +651,8 @@ def test_an_evaluation_says_whose_it_is(tmp_path, capsys):
     arguments = ["evaluate", "--bundle", str(bundle), "--world", "pillar(1.2,1.2,2)", "--episodes", "1", "--json", "-"]
     assert cli.main(arguments) == 0
     row = json.loads(capsys.readouterr().out)["pillar(1.2,1.2,2)"]
-    assert row["policies"] == str(bundle) and set(row["sha256"]) == {"planner.onnx", "skill.onnx", "manifest.json"}
+    assert row["policies"] == str(bundle)
+    files = load_bundle(bundle).manifest.files
+    assert row["sha256"] == {name: files[name] for name in ("planner.onnx", "skill.onnx")} | {
+        "manifest.json": file_sha256(bundle / "manifest.json")
+    }

@@ -32,3 +32,16 @@ def test_json_brings_its_folder_with_it(tmp_path):
     file = tmp_path / "new" / "figures.json"
     write_json(file, {"rate": 0.5})
     assert file.read_text() == '{\n  "rate": 0.5\n}\n'
+
+
+def test_a_link_stays_a_link_and_a_pipe_a_pipe(tmp_path):
+    target, link, pipe = (tmp_path / name for name in ("target", "link", "pipe"))
+    target.write_bytes(b"old")
+    link.symlink_to(target)
+    write_atomically(link, b"new")
+    assert link.is_symlink() and target.read_bytes() == b"new"
+    os.mkfifo(pipe)
+    reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_atomically(pipe, b"new")
+    assert os.read(reading, 10) == b"new" and pipe.is_fifo()
+    os.close(reading)

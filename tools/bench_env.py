@@ -46,9 +46,11 @@ def _bench_robot(robot: str, arguments: argparse.Namespace) -> dict[str, Any]:
     peer = _peer(robot, arguments.safety_python)
     if peer is not None:
         contenders["Safety-Gymnasium, 1"] = peer
-    rates = overall(race(contenders, arguments.seconds, 0.1))
-    if peer is not None:
-        peer.close()
+    try:
+        rates = overall(race(contenders, arguments.seconds, 0.1))
+    finally:
+        if peer is not None:
+            peer.close()
     for name, rate in rates.items():
         what, threads = name.split(", ")
         line = f"env {robot:6s} {what:16s} {threads} thread(s) {rate:8,.0f} steps/s"

@@ -1,7 +1,7 @@
 """Contenders of a race in processes, and if need be Pythons, of their own, that run when it is their turn.
 
 The child says "ready", or "skip" and a reason; from then on it answers each line it reads, a number of seconds, with
-what it counted in that time and the seconds it took.
+"did", what it counted in that time and the seconds it took. Whatever else it prints is its libraries' talk.
 """
 
 from __future__ import annotations
@@ -25,26 +25,37 @@ class Turns:
     """
 
     def __init__(self, command: Sequence[str]) -> None:
-        self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        # libraries print to the same stream
-        lines = iter(self._child.stdout.readline, "")  # type: ignore[union-attr]
-        answer = next((line.strip() for line in lines if line.startswith(("ready", "skip"))), "skip it ended")
-        if answer != "ready":
+        self._command = " ".join(command)
+        try:
+            self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        except OSError as error:
+            raise Skipped(f"{command[0]}: {error.strerror}") from None
+        answer = self._answer("ready", "skip")
+        if answer != ["ready"]:
             self.close()
-            raise Skipped(answer.removeprefix("skip "))
+            raise Skipped(" ".join(answer[1:]) or "it ended")
 
     def __call__(self, seconds: float) -> tuple[int, float]:
-        print(seconds, file=self._child.stdin, flush=True)
-        count, spent = self._child.stdout.readline().split()  # type: ignore[union-attr]
-        return int(count), float(spent)
+        try:
+            print(seconds, file=self._child.stdin, flush=True)
+        except BrokenPipeError:
+            pass
+        answer = self._answer("did")
+        if not answer:
+            raise RuntimeError(f"{self._command} has ended with code {self._child.wait()}")
+        return int(answer[1]), float(answer[2])
 
     def close(self) -> None:
-        self._child.stdin.close()  # type: ignore[union-attr]
-        self._child.wait()
+        self._child.communicate()
+
+    def _answer(self, *words: str) -> list[str]:
+        """The next line that begins with one of those words, in words; empty if the child has ended."""
+        lines = (line.split() for line in iter(self._child.stdout.readline, ""))  # type: ignore[union-attr]
+        return next((line for line in lines if line and line[0] in words), [])
 
 
 def take_turns(run: Callable[[], int]) -> None:
     """The child's side: call `run`, which counts what it does, for as long as is asked, until nobody asks any more."""
     print("ready", flush=True)
     for line in sys.stdin:
-        print(*timed(run, float(line)), flush=True)
+        print("did", *timed(run, float(line)), flush=True)

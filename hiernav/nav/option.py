@@ -199,6 +199,8 @@ class WaypointOption:
         self._all_rows = np.arange(self.num_rows)
         self.plan = np.full(shape, np.nan)
         self.start = np.full((self.num_rows, 2), np.nan)
+        self.goal = np.full((self.num_rows, 2), np.nan)
+        """(N, 2) that the plan leads to, or the one that is waited for, world frame [m]; NaN where there is neither."""
         self.started = np.zeros(self.num_rows, dtype=bool)
         self.age = np.zeros(self.num_rows, dtype=np.int64)
         self.visits: list[VisitMap | None] = [None] * self.num_rows
@@ -217,7 +219,7 @@ class WaypointOption:
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Forget plans, visits and counts of some rows (all by default), as at the start of an episode."""
         rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
-        self.plan[rows], self.start[rows] = np.nan, np.nan
+        self.plan[rows], self.start[rows], self.goal[rows] = np.nan, np.nan, np.nan
         self.started[rows], self.age[rows] = False, 0
         self.counts[rows], self.refused[rows] = 0, 0
         self.waiting[rows] = self._adopted[rows] = False
@@ -231,7 +233,7 @@ class WaypointOption:
         They hold their position until another plan comes.
         """
         rows = slice(None) if rows is None else rows
-        self.plan[rows], self.start[rows] = np.nan, np.nan
+        self.plan[rows], self.start[rows], self.goal[rows] = np.nan, np.nan, np.nan
         self.started[rows] = self.waiting[rows] = self._adopted[rows] = False
 
     def adopt(self, row: int, plan: np.ndarray, start: np.ndarray, occupancy: OccupancyMap) -> bool:
@@ -401,6 +403,9 @@ class WaypointOption:
         plan[hold] = position[hold][:, None]
         for k in np.flatnonzero(good | hold).tolist():
             self._follow(int(rows[k]), plan[k], position[k], occupancy[k])
+        # a plan that comes later may be any of those that were asked for since the first time
+        new = good | (asked & ~self.waiting[rows])
+        self.goal[rows[new]] = goal[new]
         self.started[rows[good]] = True
         self.waiting[rows[asked]] = ~good[asked]
         return good
@@ -453,15 +458,13 @@ class HierarchicalAgent:
     def __post_init__(self) -> None:
         self.recovery = Recovery(self.option.num_rows, self.control_period, self.option.sweep_radius)
         self._steps = np.zeros(self.option.num_rows, dtype=np.int64)
-        self._goal = np.full((self.option.num_rows, 2), np.nan)  # what the plans lead to
         self._clocked = "clock" in self.layout.names
 
     def reset(self, rows: np.ndarray | None = None) -> None:
         """Start new episodes in some rows (all by default)."""
         self.option.reset(rows)
         self.recovery.reset(rows)
-        pick = slice(None) if rows is None else rows
-        self._steps[pick], self._goal[pick] = 0, np.nan
+        self._steps[slice(None) if rows is None else rows] = 0
 
     def act(
         self,
@@ -476,8 +479,7 @@ class HierarchicalAgent:
         Args:
             pose: (N, 3) world frame [m, m, rad].
             terms: the robot's sensors by name, (N, d) each; waypoints and goal are added here.
-            goal: (N, 2) world frame [m]. Where it has moved by more than `option.goal_radius` since the plan was made,
-                the plan is void.
+            goal: (N, 2) world frame [m]; see `turn_to`.
             occupancy: N maps as they are now.
             stamps: (N,) when the maps were made, on any clock [s]; the time of the steps by default.
 
@@ -491,8 +493,7 @@ class HierarchicalAgent:
                 f"HierarchicalAgent.act: poses {pose.shape}, goals {goal.shape} and {len(occupancy)} maps, "
                 f"expected ({rows}, 3), ({rows}, 2) and {rows}"
             )
-        if not np.array_equal(goal, self._goal):
-            self._take_goals(goal)
+        self.turn_to(goal)
         since = self._steps * self.control_period
         step, plan, observation = observe(
             self.option,
@@ -508,12 +509,19 @@ class HierarchicalAgent:
         self._steps += 1
         return AgentStep(self.skill(observation), plan, observation, step)
 
-    def _take_goals(self, goal: np.ndarray) -> None:
-        """Drop the plans that lead to other goals (N, 2) than these."""
-        new = np.isnan(self._goal).any(axis=1)
-        moved = path.distances(goal, self._goal) > self.option.goal_radius
-        self.option.drop(np.flatnonzero(moved))
-        self._goal[new | moved] = goal[new | moved]
+    def turn_to(self, goal: np.ndarray) -> np.ndarray:
+        """Give up plans and ways out that lead elsewhere than to these goals (N, 2), world frame [m].
+
+        A goal is another one where it is farther than `option.goal_radius` from the one that was planned for.
+
+        Returns:
+            The rows (M,) in which it is.
+        """
+        moved = np.flatnonzero(path.distances(goal, self.option.goal) > self.option.goal_radius)
+        if len(moved):
+            self.option.drop(moved)
+            self.recovery.reset(moved)
+        return moved
 
 
 def observe(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import torch
 from torch import nn
@@ -340,6 +341,16 @@ def settings_of_data(config: TrainConfig) -> LabelSettings:
             )
     require_samples(folder, manifest, config.planner.samples)
     return theirs
+
+
+def with_worlds_of_data(config: TrainConfig) -> TrainConfig:
+    """A configuration whose planner learns from a data set, with the worlds that this was made in.
+
+    Raises:
+        DatasetError: see `settings_of_data`.
+    """
+    worlds = settings_of_data(config).worlds
+    return msgspec.structs.replace(config, planner=msgspec.structs.replace(config.planner, worlds=worlds))
 
 
 def reflect(image: torch.Tensor, label: torch.Tensor, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

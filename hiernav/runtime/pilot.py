@@ -221,6 +221,8 @@ class Pilot:
             occupancy: map as it is now.
         """
         option, refusals = self.agent.option, int(self.agent.option.refused[0])
+        if len(self.agent.turn_to(goal[None])):
+            self.drop()  # the plan that is on its way too
         answered = self._take_answer(now, estimate.stamp)
         pose = estimate.pose[None]
         step = self.agent.act(pose, terms, goal[None], (occupancy,), np.array([estimate.stamp]))

@@ -77,6 +77,29 @@ def test_a_goal_that_creeps_is_planned_for_anew_once_it_is_elsewhere() -> None:
     assert reasons == [START, NONE, NONE, START, NONE, NONE, START]  # the goal's radius is 0.3 m
 
 
+def test_a_goal_is_another_one_by_how_far_it_is_from_the_one_that_was_planned_for() -> None:
+    agent, sensors = agent_of(1)
+
+    def reason(y: float) -> int:
+        return int(agent.act(np.zeros((1, 3)), sensors, np.array([[2.0, y]]), [FREE]).reason[0])
+
+    assert [reason(0.0), reason(0.25)] == [START, NONE]
+    agent.option.waiting[0] = True  # a plan for 0.25
+    assert [reason(0.25), reason(0.35), reason(-0.04), reason(-0.1)] == [NONE, NONE, NONE, START]
+
+
+def test_a_new_goal_ends_a_way_out() -> None:
+    agent, sensors = agent_of(1)
+    goals = np.array([[FAR], [(-2.5, 0.0)]])
+    agent.act(np.zeros((1, 3)), sensors, goals[0], [FREE])
+    agent.recovery.ask(0)
+    led_out = agent.act(np.zeros((1, 3)), sensors, goals[0], [FREE])
+    assert agent.recovery.active[0]
+    step = agent.act(np.zeros((1, 3)), sensors, goals[1], [FREE])
+    assert not agent.recovery.active[0] and not np.array_equal(step.plan, led_out.plan)
+    assert_allclose(step.plan[0, -1], [-1.0, 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize(("poses", "goals", "maps"), [(3, 2, 2), (2, 1, 2), (2, 2, 1)])
 def test_rows_that_the_agent_was_not_made_for_are_refused(poses: int, goals: int, maps: int) -> None:
     agent, sensors = agent_of(2)

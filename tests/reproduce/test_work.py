@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -238,10 +239,19 @@ def test_a_queue_that_is_killed_leaves_no_process_at_work(tmp_path):
     told, script = tmp_path / "told", tmp_path / "script.py"
     os.mkfifo(told)
     script.write_text(f"TOLD = {str(told)!r}\n{WORK_OF_A_QUEUE}")
-    with subprocess.Popen([sys.executable, str(script)]) as parent, told.open() as read:
-        assert read.readline() == "at work\n"
-        parent.kill()
-        assert read.read() == ""
+    pipe = os.open(told, os.O_RDONLY | os.O_NONBLOCK)
+
+    def said() -> bytes:
+        assert select.select([pipe], [], [], 120.0)[0], "nothing was said"
+        return os.read(pipe, 100)
+
+    with subprocess.Popen([sys.executable, str(script)]) as parent:
+        try:
+            assert said() == b"at work\n"
+        finally:
+            parent.kill()
+        assert said() == b""  # nobody has the pipe open any more
+    os.close(pipe)
 
 
 def test_a_queue_that_is_asked_to_end_ends_with_its_process_and_without_a_result(tmp_path):
