@@ -176,6 +176,8 @@ MUTANTS = (
     Mutant("stop in time", WATCH, "now - self._since > self.timeout:", "False:", f"{T}/test_driver.py"),
     Mutant("rehearsal that takes too long", f"{R}/loop.py", "if self._spoilt >= SPOILT:", "if False:",
            f"{T}/test_loop.py"),
+    Mutant("plan on its way to another goal", f"{R}/pilot.py", "if len(self.agent.turn_to(goal[None])):", "if False:",
+           f"{T}/test_pilot.py"),
     Mutant("policies of another rate", f"{R}/driver.py", "if not math.isclose(trained,",
            "if False and not math.isclose(trained,", f"{T}/test_driver.py"),
     Mutant("bundle of another rate", "hiernav/nav/bundle.py", "if not abs(period - theirs) <= 1e-6:", "if False:",
