@@ -16,8 +16,8 @@ pytest.importorskip("tensorboard")
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # noqa: E402
 
 SKILL = {
-    "reach_rate", "episode_steps", "collisions_per_step", "updates", "alpha", "entropy", "q_value", "td_error",
-    "loss_actor", "loss_qvalue", "loss_alpha", *(f"reward/{term}" for term in TERMS),
+    "reach_rate", "episode_steps", "collisions_per_step", "reward_per_step", "updates", "alpha", "entropy", "q_value",
+    "td_error", "loss_actor", "loss_qvalue", "loss_alpha", *(f"reward/{term}" for term in TERMS),
     *(f"replans/{reason.name.lower()}" for reason in TerminationReason if reason > TerminationReason.START),
 }  # fmt: skip
 PLANNER = {"loss", "error", "blocked_waypoints", "walk_collisions", "walk_reach_rate"}
