@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -18,6 +19,7 @@ from hiernav.evaluate import (
     episode_seeds,
     evaluate,
     evaluate_plans,
+    fingerprints,
     make_planner,
     open_policies,
     summarize,
@@ -358,3 +360,11 @@ def test_a_bundle_with_another_number_of_actions_is_not_measured(monkeypatch):
     monkeypatch.setattr("hiernav.evaluate.get_robot", lambda name: replace(get_robot(name), action_dim=3))
     with pytest.raises(BundleError, match="actions: 2 in the bundle, 3 on this robot"):
         open_policies(POINT_BUNDLE)
+
+
+@pytest.mark.train
+def test_the_policies_of_a_run_are_known_by_their_files(trained_run):
+    names = ("planner/checkpoint.pt", "skill/checkpoint.pt", "config.yaml")
+    assert fingerprints(trained_run) == {
+        name: hashlib.sha256((trained_run / name).read_bytes()).hexdigest() for name in names
+    }
