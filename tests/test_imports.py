@@ -183,6 +183,22 @@ def test_a_control_process_loads_neither_physics_nor_search_nor_plots() -> None:
     assert done.stdout.strip() == ""
 
 
+def test_the_first_step_of_an_agent_imports_nothing_any_more() -> None:
+    """What it plans with takes a quarter of a second to import, which is many control steps."""
+    code = (
+        "import sys\nimport numpy as np\nimport hiernav\n"
+        f"bundle = hiernav.load_bundle({str(PACKAGE.parent / 'deploy' / 'bundles' / 'point')!r})\n"
+        "agent = hiernav.make_agent(bundle, robot_radius=0.1)\n"
+        f"office = hiernav.load_map({str(PACKAGE.parent / 'configs' / 'maps' / 'office.yaml')!r})\n"
+        "readings = {name: np.zeros((1, size)) for name, size in bundle.layout.sensors.items()}\n"
+        "before = set(sys.modules)\n"
+        "agent.act(np.array([[1.5, 2.0, 0.0]]), readings, np.array([[10.0, 6.0]]), [office])\n"
+        "print(*sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == ""
+
+
 def test_importing_hiernav_on_a_robot_loads_nothing_else() -> None:
     code = (
         "import sys\n"

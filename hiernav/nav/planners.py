@@ -53,6 +53,9 @@ class ShortestPathPlanner:
     """Planning cells of all kept fields together."""
     _fields: OrderedDict[tuple[int, float, float], PathField] = field(default_factory=OrderedDict, repr=False)
 
+    def __post_init__(self) -> None:
+        import scipy.sparse.csgraph  # noqa: F401  now, and not in the control step that searches first
+
     def plan(self, query: PlanQuery) -> np.ndarray:
         plans = np.full((len(query.position), self.num_waypoints, 2), np.nan)
         for row, (position, goal, occupancy) in enumerate(
