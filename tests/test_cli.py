@@ -19,7 +19,7 @@ import pytest
 import tiny_run
 from without_torch import BLOCK
 
-from hiernav import cli
+from hiernav import check, cli
 from hiernav.config import describe_config, load_config
 from hiernav.evaluate import wilson_interval
 from hiernav.nav.bundle import file_sha256, load_bundle
@@ -506,7 +506,7 @@ def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
 
 def test_a_baseline_has_no_use_for_a_data_set():
     config = load_config(None, ["skill.preset=baseline", "planner.data=nowhere"])
-    assert cli._with_worlds_of_data(config, []) is config
+    assert check._with_worlds_of_data(config, []) is config
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

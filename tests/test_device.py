@@ -10,6 +10,7 @@ import tiny_run
 torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 
 from hiernav import cli  # noqa: E402
+from hiernav.commands import exits  # noqa: E402
 from hiernav.decode import ConfigError  # noqa: E402
 from hiernav.device import choose_device, random_state, restore_random_state  # noqa: E402
 
@@ -45,7 +46,7 @@ def test_a_gpu_that_is_not_there_is_refused_before_a_run_folder_is_made(
     gpu: bool, key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
-    assert cli.main(["train", *tiny_run.arguments(folder, f"{key}=cuda")]) == cli.BAD_INPUT
+    assert cli.main(["train", *tiny_run.arguments(folder, f"{key}=cuda")]) == exits.BAD_INPUT
     assert key in capsys.readouterr().err and not folder.exists()
 
 

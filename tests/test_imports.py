@@ -50,7 +50,9 @@ ALLOWED = {
         "lock",
     },
     "report": {"evaluate", "reproduce", "run", "sim", "files"},
-    "cli": {
+    "check": {"sim", "planner", "config", "run", "device"},
+    "commands": {
+        "check",
         "nav",
         "sim",
         "evaluate",
@@ -68,6 +70,7 @@ ALLOWED = {
         "files",
         "runtime",
     },
+    "cli": {"commands", "run"},
 }
 EXTRA_ALLOWED = {"runtime/sim_robot.py": {"sim"}}
 TRAINING_PACKAGES = {"torch", "torchrl", "tensordict"}

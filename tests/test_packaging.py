@@ -20,7 +20,7 @@ EXTRAS = {
     **dict.fromkeys(
         ("planner", "skill", "training", "export", "finetune", "envs", "device", "evaluate", "run"), {"train"}
     ),
-    **dict.fromkeys(("skill/machines.py", "cli.py"), {"train", "ray"}),
+    **dict.fromkeys(("skill/machines.py", "check.py"), {"train", "ray"}),
     "sim/gym.py": {"train"},
 }
 """What files may need beyond the base installation."""

@@ -70,15 +70,18 @@ def test_links_of_the_documents_lead_somewhere(document: str) -> None:
 
 
 def snippets() -> list[str]:
-    """Indented blocks of the README that begin with an import."""
+    """Indented blocks of the README that begin with an import, and of the one that trains for minutes the imports."""
     text = (ROOT / "README.md").read_text()
     blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", text, re.MULTILINE)
     code = ["\n".join(line[4:] for line in block.strip("\n").split("\n")) for block in blocks]
-    return [block for block in code if block.startswith(("import ", "from "))]
+    training = next(block for block in code if block.startswith("# what `hiernav train`"))
+    trained = training.partition("\n\n")
+    compile(trained[2], "README.md", "exec")
+    return [trained[0], *(block for block in code if block.startswith(("import ", "from ")))]
 
 
 def test_there_are_snippets() -> None:
-    assert len(snippets()) == 3
+    assert len(snippets()) == 4
 
 
 @pytest.mark.parametrize("code", snippets())

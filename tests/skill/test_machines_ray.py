@@ -13,6 +13,7 @@ import tiny_run  # noqa: E402
 import worker_shares as workers  # noqa: E402
 
 from hiernav import cli  # noqa: E402
+from hiernav.commands import exits  # noqa: E402
 from hiernav.skill.train import SkillTrainer  # noqa: E402
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
@@ -41,6 +42,6 @@ def test_a_cluster_makes_the_run_that_the_processes_of_one_machine_make(tmp_path
 
 def test_more_workers_than_processors_are_refused_with_both_numbers(tmp_path, capsys) -> None:
     settings = tiny_run.arguments(tmp_path / "run", HERE, "planner.epochs=1")
-    assert cli.main(["train", "--collector", "ray", "--workers", "1000", *settings]) == cli.BAD_INPUT
+    assert cli.main(["train", "--collector", "ray", "--workers", "1000", *settings]) == exits.BAD_INPUT
     assert "need 1000 processors; the Ray cluster has" in capsys.readouterr().err
     assert not ray.is_initialized()

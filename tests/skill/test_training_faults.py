@@ -23,6 +23,7 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
 from hiernav import cli  # noqa: E402
+from hiernav.commands import exits  # noqa: E402
 from hiernav.run import Run, RunError, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import Layout, parse_world  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
@@ -214,12 +215,12 @@ def test_a_training_does_not_go_on_without_its_replay(trained, at_step, tmp_path
 
     run, copy = tmp_path / "run", tmp_path / "copy"
     at_step(384, stop)
-    assert trained()[0] == cli.INTERRUPTED
+    assert trained()[0] == exits.INTERRUPTED
     shutil.copytree(run, copy)
     shutil.rmtree(copy / "skill" / "replay")
     for _ in range(2):  # what the first attempt has made is not taken for the lost one by the second
         code, line = trained("--resume", str(copy))
-        assert code == cli.BAD_INPUT
+        assert code == exits.BAD_INPUT
         assert line.startswith(f"hiernav train: {copy / 'skill' / 'replay'} is missing, ") and "from step 256: " in line
     shutil.copytree(run / "skill" / "replay", copy / "skill" / "replay")
     assert trained("--resume", str(copy))[0] == 0
@@ -230,7 +231,7 @@ def test_a_finished_training_is_not_made_longer(trained_run, trained, tmp_path):
     longer = (run / "config.yaml").read_text().replace("total_steps: 768", "total_steps: 1024")
     (run / "config.yaml").write_text(longer)
     code, line = trained("--resume", str(run))
-    assert code == cli.BAD_INPUT and "begin a new run to train for longer" in line
+    assert code == exits.BAD_INPUT and "begin a new run to train for longer" in line
 
 
 KILLED_IN_A_SEGMENT = """
