@@ -200,11 +200,6 @@ class VisitMap:
         counts[:] = self.counts
         self.counts = counts
 
-    def clear(self) -> None:
-        """Forget every visit, as at the start of an episode."""
-        self.counts = np.zeros_like(self.counts)
-        self._last_pixel = None
-
     def near(self, position: ArrayLike, radius: float) -> bool:
         """Whether the robot has been in a pixel that meets the square of half-side `radius` [m] around a position."""
         x, y = np.asarray(position, dtype=np.float64).tolist()

@@ -299,10 +299,6 @@ class Driver:
         """The goal that ended last, whether the robot has been seen to stand since or not."""
         return self._last_trip
 
-    def truth(self) -> Truth | None:
-        """What really is, where the robot is a simulated one."""
-        return None if self._truth is None else self._truth()
-
     @property
     def estimate(self) -> Estimate | None:
         """The newest."""

@@ -152,11 +152,6 @@ class Pilot:
         return {} if counts is None else counts()
 
     @property
-    def recoveries(self) -> int:
-        """Since the reset."""
-        return int(self.agent.recovery.counts[0])
-
-    @property
     def failed(self) -> str | None:
         """Why no plan is to be expected any more, or None."""
         return None if self.link is None else self.link.failed

@@ -170,8 +170,6 @@ def test_visits_are_clipped_and_ignore_what_lies_outside() -> None:
     before = visits.counts.copy()
     visits.add([(3.0, 0.0), (np.nan, np.nan), (-1.2, 0.5)])
     assert (visits.counts == before).all()
-    visits.clear()
-    assert not visits.counts.any()
 
 
 def test_visits_are_found_within_a_square_around_a_position() -> None:
