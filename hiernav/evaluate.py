@@ -242,13 +242,13 @@ def summarize(episodes: Sequence[Episode], knows_reward: bool = True) -> dict[st
     }
 
 
-def wilson_interval(successes: int, trials: int, z: float = _Z95) -> tuple[float, float]:
-    """Wilson score interval of a rate (95 % by default)."""
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a rate."""
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
-    rate, z2 = successes / trials, z * z / trials
+    rate, z2 = successes / trials, _Z95 * _Z95 / trials
     middle = (rate + z2 / 2) / (1 + z2)
-    half = z * np.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials)) / (1 + z2)
+    half = _Z95 * np.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials)) / (1 + z2)
     return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 

@@ -79,16 +79,16 @@ def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
     return {**results, "sample_ratio": bare / results["sample"]}
 
 
-def bench_prediction(period: float = 0.1, seconds: float = 4.0, episodes: int = 100) -> dict[str, Any]:
+def bench_prediction() -> dict[str, Any]:
     """What a prediction of a map costs, and how far from what moves it draws it, once that has been watched."""
     from hiernav.nav.prediction import AHEAD_S, WINDOW_S, MapPredictor
     from hiernav.sim.layout import parse_world
     from hiernav.sim.worlds import sample_layout
 
     errors, spent, count = [], 0.0, 0
-    for seed in range(episodes):
+    for seed in range(100):
         layout, predictor = sample_layout(parse_world(MOVING_WORLD), seed), MapPredictor()
-        for now in np.arange(0.0, seconds, period).tolist():
+        for now in np.arange(0.0, 4.0, 0.1).tolist():
             occupancy = layout.occupancy(now)
             began = time.process_time()
             ahead = predictor(occupancy, now, layout.start[:2])

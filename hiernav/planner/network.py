@@ -44,13 +44,13 @@ class HypothesisNetwork(nn.Module):
 
     channels = goselo.METRIC_CHANNELS
 
-    def __init__(self, waypoints: int = 10, spacing: float = 0.1, hypotheses: int = 6, width: int = 128) -> None:
+    def __init__(self, waypoints: int = 10, spacing: float = 0.1, hypotheses: int = 6) -> None:
         super().__init__()
         self.waypoints, self.spacing, self.hypotheses = waypoints, spacing, hypotheses
         self.overview = nn.Sequential(_patches(3, 32), _down(32, 48), _squeeze(48, 8))
         self.local = nn.Sequential(_patches(1, 32), _down(32, 48), _squeeze(48, 16))
-        self.trunk = nn.Sequential(nn.Linear(64 * (8 + 16) + 2, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
-        self.head = nn.Linear(width, hypotheses * (2 * waypoints + 1))
+        self.trunk = nn.Sequential(nn.Linear(64 * (8 + 16) + 2, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
+        self.head = nn.Linear(128, hypotheses * (2 * waypoints + 1))
 
     def forward(self, image: torch.Tensor, distance: torch.Tensor) -> Output:
         scaled = image.float() / 255.0

@@ -9,13 +9,13 @@ import numpy as np
 from hiernav.nav import goselo
 from hiernav.planner.dataset import LabelSettings, Samples
 
-_COLUMNS = 6
+_SAMPLES, _COLUMNS = 24, 6
 _CELL_INCH = 1.25
 _PATH, _ROBOT, _GOAL, _VISITS = "#dd6b20", "#2b6cb0", "#2f855a", (0.17, 0.42, 0.69)
 
 
-def draw_sheet(samples: Samples, settings: LabelSettings, path: str | Path, count: int = 24, seed: int = 0) -> None:
-    """Write a PNG of `count` random samples with their labels.
+def draw_sheet(samples: Samples, settings: LabelSettings, path: str | Path) -> None:
+    """Write a PNG of 24 random samples with their labels.
 
     Every sample has two pictures, the goal above the robot in both: the crop of side 2 L with obstacles and visits,
     and the clearance around the robot at its metric size (3.2 m).
@@ -23,7 +23,7 @@ def draw_sheet(samples: Samples, settings: LabelSettings, path: str | Path, coun
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    chosen = np.random.default_rng(seed).permutation(len(samples))[:count]
+    chosen = np.random.default_rng(0).permutation(len(samples))[:_SAMPLES]
     columns = min(_COLUMNS, len(chosen))
     rows = -(-len(chosen) // columns)
     figure = Figure(figsize=(2 * columns * _CELL_INCH, rows * (_CELL_INCH + 0.2)), layout="constrained")

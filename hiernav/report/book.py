@@ -185,9 +185,9 @@ def _what_changed(result: Result, root: Path) -> str:
     return "older settings" if same else "older bundle"
 
 
-def curve(result: Result, name: str, stage: str = "evaluation") -> tuple[np.ndarray, np.ndarray]:
-    """Steps and values of what a training logged: (T,) and (T,), NaN where a value is not known."""
-    points: list[dict[str, Any]] = list(result.curves.get(stage, []))
+def curve(result: Result, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (T,) of the evaluations during a training, and a value (T,) of each, NaN where it is not known."""
+    points: list[dict[str, Any]] = list(result.curves.get("evaluation", []))
     values = [math.nan if point.get(name) is None else point[name] for point in points]
     return np.array([point["step"] for point in points], dtype=float), np.array(values, dtype=float)
 

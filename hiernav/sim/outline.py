@@ -15,9 +15,9 @@ _CORNERS = 32
 class Outlines:
     """Outlines of the geoms of a robot, whatever its joints are doing."""
 
-    def __init__(self, model: mujoco.MjModel, body: str = "robot") -> None:
-        """`body` is the root of the robot's bodies; KeyError if `model` has none of that name."""
-        root = model.body(body).id
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """KeyError if `model` has no body "robot", the root of the robot's bodies."""
+        root = model.body("robot").id
         self._model = model
         self._geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == root).tolist()
         angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False)

@@ -12,6 +12,9 @@ from hiernav.nav.occupancy import VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.sim.layout import Layout
 
+_STRIDE = 5
+"""Waypoints that are walked along before the next plan."""
+
 
 @dataclass
 class WalkResult:
@@ -33,10 +36,8 @@ class WalkResult:
         }
 
 
-def walk(
-    planner: Planner, layouts: Sequence[Layout], radius: float = 0.1, stride: int = 5, max_plans: int = 60
-) -> WalkResult:
-    """Move a disc along the first `stride` waypoints of a plan, plan anew, and so on until the goal.
+def walk(planner: Planner, layouts: Sequence[Layout], radius: float = 0.1, max_plans: int = 60) -> WalkResult:
+    """Move a disc along the first five waypoints of a plan, plan anew, and so on until the goal.
 
     Every waypoint at which the disc touches an obstacle counts one collision; the disc moves on all the same.
 
@@ -68,8 +69,8 @@ def walk(
         for row, plan in zip(rows, proposed, strict=True):
             if not np.isfinite(plan).all():
                 continue
-            touched = ~maps[row].is_free(plan[:stride], radius)
-            for waypoint, hit in zip(plan[:stride], touched, strict=True):
+            touched = ~maps[row].is_free(plan[:_STRIDE], radius)
+            for waypoint, hit in zip(plan[:_STRIDE], touched, strict=True):
                 position[row] = waypoint
                 visits[row].add(waypoint)
                 collisions[row] += hit

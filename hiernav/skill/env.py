@@ -30,8 +30,8 @@ class NavigationEnv(EnvBase):
     from a broken robot.
     """
 
-    def __init__(self, task: NavigationTask, device: str = "cpu") -> None:
-        super().__init__(device=torch.device(device), batch_size=torch.Size([task.num_rows]))
+    def __init__(self, task: NavigationTask) -> None:
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([task.num_rows]))
         self.task = task
         n, size, actions = task.num_rows, task.layout.size, task.robot.action_dim
         flag = {"n": 1, "shape": (n, 1), "dtype": torch.bool}
