@@ -27,6 +27,8 @@ _FARTHEST = 100.0
 _FALL_BETWEEN_CELLS = 0.15 * CELL
 """What a shortest path may lack of its radius [m]: the disc is known to fit at the centres of cells, and between two of
 them the clearance may be lower."""
+_LEAST_GAIN = 0.5
+"""Share of its length by which a plan must shorten the way to the goal."""
 _TIGHTNESS = 4.0
 """Score that a hypothesis loses which leaves nothing beyond the radius."""
 
@@ -169,8 +171,6 @@ class VerifiedPlanner:
     """Disc that must fit along the plan [m]."""
     goal_radius: float = GOAL_RADIUS
     """Plans are judged up to where they come this close to the goal [m]."""
-    least_gain: float = 0.5
-    """Share of its length by which a plan must shorten the way to the goal."""
     tally: Counter[str] = field(default_factory=Counter, init=False)
     """See `counts`."""
 
@@ -233,7 +233,7 @@ class VerifiedPlanner:
         here, there = field.way_from(query.position[row]), field.way_from(driven[-1])
         length = arc_lengths(polyline(query.position[row][None], driven[None]))[0, -1]
         # less a cell, which is how exactly the way is known; where there is none, inf - inf speaks for no plan
-        return here - there < self.least_gain * float(length) - CELL
+        return here - there < _LEAST_GAIN * float(length) - CELL
 
     def _leads_back(self, plan: np.ndarray, visits: VisitMap) -> bool:
         return any(visits.near(point, self.radius) for point in plan[len(plan) // 2 :])

@@ -56,9 +56,9 @@ class MapPredictor:
     map does not change any more.
     """
 
-    def __init__(self, radius: float = 0.1, ahead_s: float = AHEAD_S) -> None:
+    def __init__(self, radius: float = 0.1) -> None:
         """`radius` is the robot's [m]."""
-        self._radius, self._ahead = radius, ahead_s
+        self._radius = radius
         self.reset()
 
     def reset(self) -> None:
@@ -107,7 +107,7 @@ class MapPredictor:
         self._watch(stamp, obstacles.centers, obstacles.sides, occupancy.resolution)
         velocity, turn = self._motions(occupancy.resolution)
         # at five points of its way, the first of which is where it is
-        ways = velocity[:, None] * _arc(turn[:, None], np.linspace(0.0, self._ahead, 5))
+        ways = velocity[:, None] * _arc(turn[:, None], np.linspace(0.0, AHEAD_S, 5))
         apart = np.abs(obstacles.centers[:, None] + ways - complex(*position)).min(axis=1)
         # the pixels of an obstacle reach up to one farther than it does itself
         size = obstacles.sides[:, 1] - obstacles.sides[:, 0]

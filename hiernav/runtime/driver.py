@@ -151,7 +151,6 @@ class Driver:
         estimator: Estimator | None = None,
         guard: Guard | None = None,
         config: DriverConfig | None = None,
-        timer: TickTimer | None = None,
         observers: Sequence[Observer] = (),
         rehearsal: float = 0.0,
     ) -> None:
@@ -161,7 +160,7 @@ class Driver:
             pilot: planner and skill.
             occupancy: the known map at a stamp of the robot's clock [s].
             clock: paces the loop.
-            estimator, guard, config, timer: defaults if None.
+            estimator, guard, config: defaults if None.
             observers: told of every tick and event; one that raises is dropped.
             rehearsal: how long before each tick one is rehearsed to warm the caches [s]; 0, or a period of less than
                 four times that, does without.
@@ -174,7 +173,7 @@ class Driver:
         self.guard = guard or Guard(robot.action_dim)
         self._require_fit()
         self.config = config or DriverConfig()
-        self.timer = timer or TickTimer(SECTIONS)
+        self.timer = TickTimer(SECTIONS)
         self.audience = Audience(observers)
         self.supervisor = Supervisor(lambda now, mode, why: self._emit("mode", why, now, mode=mode.value))
         prepare = self._rehearse if 0.0 < 4.0 * rehearsal <= robot.control_period else None
@@ -234,14 +233,14 @@ class Driver:
         self._serving = True
         self._loop()
 
-    def set_goal(self, goal: np.ndarray, max_steps: int | None = None) -> Ticket:
+    def set_goal(self, goal: np.ndarray) -> Ticket:
         """Drive to `goal` (2,), world frame [m], instead of to the present one if there is one.
 
         Raises:
             ValueError: the goal is not two finite numbers.
         """
         goal, ticket = _checked_goal(goal), Ticket()
-        return self._ask(lambda now: self._start_trip(goal, max_steps, now, ticket), ticket)
+        return self._ask(lambda now: self._start_trip(goal, None, now, ticket), ticket)
 
     def cancel(self) -> Ticket:
         """Give up the present goal, and stop."""

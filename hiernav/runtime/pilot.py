@@ -12,6 +12,9 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
 from hiernav.runtime.estimate import Estimate
 
+MAX_PLAN_AGE = 1.0
+"""Of the state that a plan was made from, when the plan arrives [s]."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -112,17 +115,16 @@ class Pilot:
     """One agent for one robot.
 
     With a planner that answers later, every tick in which a plan is due asks with the newest state, and the plan that
-    comes is followed from the state it was made for, unless that is older than `max_age` or of another clock.
+    comes is followed from the state it was made for, unless that is older than `MAX_PLAN_AGE` or of another clock.
     """
 
-    def __init__(self, agent: HierarchicalAgent, link: PlannerLink | None = None, max_age: float = 1.0) -> None:
+    def __init__(self, agent: HierarchicalAgent, link: PlannerLink | None = None) -> None:
         """
         Args:
             agent: with one row; its option's planner is `link`, if there is one.
             link: brings the plans that were asked for earlier.
-            max_age: of the state a plan was made from, when it arrives [s].
         """
-        self.agent, self.link, self.max_age = agent, link, max_age
+        self.agent, self.link = agent, link
         self._sensed = list(agent.layout.sensors)
         self._sound = SoundPlanner(agent.option.planner)
         agent.option.planner = self._sound
@@ -131,7 +133,7 @@ class Pilot:
         self.reset()
 
     @property
-    def sizes(self) -> dict[str, int] | None:
+    def sizes(self) -> dict[str, int]:
         """How many values each sensor gives that the skill observes, by name."""
         return self.agent.layout.sensors
 
@@ -254,7 +256,7 @@ class Pilot:
         answer = link.answer(now)
         if answer is None or not option.waiting[0]:
             return None
-        if not 0.0 <= stamp - answer.stamp <= self.max_age:
+        if not 0.0 <= stamp - answer.stamp <= MAX_PLAN_AGE:
             self.late += 1
             return None
         plan = answer.plan

@@ -49,7 +49,7 @@ class Rehearsal:
         self._stamp = 0.0
 
     def __call__(
-        self, frame: SensorFrame, estimate: Estimate, goal: np.ndarray, occupancy: OccupancyMap, anew: bool = False
+        self, frame: SensorFrame, estimate: Estimate, goal: np.ndarray, occupancy: OccupancyMap, anew: bool
     ) -> None:
         """Rehearse with the last tick's values; with `anew` a tick in which a plan ends."""
         if anew:

@@ -117,23 +117,19 @@ class RobotGone(RuntimeError):
     """The robot cannot be read, nor will it ever be again: what drives it must be started anew."""
 
 
+COMMAND_TIMEOUT = 0.05
+"""Age at which a command is no longer followed [s]."""
+
+
 class CommandWatchdog:
     """Tells an adapter that its last command is too old to be followed."""
 
-    def __init__(self, control_period: float, timeout: float = 0.05) -> None:
-        """
-        Args:
-            control_period: [s].
-            timeout: age at which a command expires [s]. At least one and a half control periods are granted, so
-                that a robot with a period above the timeout can be driven at all.
-
-        Raises:
-            ValueError: a time is not finite and positive.
-        """
-        for name, value in (("control_period", control_period), ("timeout", timeout)):
-            if not 0.0 < value < float("inf"):
-                raise ValueError(f"CommandWatchdog: {name} {value} s must be finite and positive")
-        self.timeout = max(timeout, 1.5 * control_period)
+    def __init__(self, control_period: float) -> None:
+        """`control_period` is the robot's [s]; ValueError unless it is finite and positive."""
+        if not 0.0 < control_period < float("inf"):
+            raise ValueError(f"CommandWatchdog: control_period {control_period} s must be finite and positive")
+        # one and a half periods are granted, so that a robot with a long one can be driven at all
+        self.timeout = max(COMMAND_TIMEOUT, 1.5 * control_period)
         self.trips = 0
         self._fed_at: float | None = None
         self._tripped = False

@@ -18,7 +18,7 @@ from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame, 
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
-from hiernav.sim.scene import SceneSpec, scene_for
+from hiernav.sim.scene import scene_for
 from hiernav.sim.worlds import sample_layout
 
 __all__ = ["EXACT", "SensorNoise", "SimRobot", "make"]
@@ -57,22 +57,20 @@ class SimRobot:
         noise: SensorNoise | None = None,
         seed: int = 0,
         clock: Clock | None = None,
-        scene: SceneSpec | None = None,
     ) -> None:
         """
         Args:
             robot: what to simulate.
-            layout: where; also start pose and obstacles.
+            layout: where; also start pose and obstacles. `reset` takes others of the same kind of world.
             noise: of the sensors.
             seed: of the noise.
             clock: time to live in; None lets time pass with commands only.
-            scene: obstacle slots, where layouts of several worlds will follow; by default those of `layout`'s world.
         """
         self.spec = robot
         self.noise = noise or SensorNoise()
         self.watchdog = CommandWatchdog(robot.control_period)
         self._clock = clock
-        self._sim = BatchSim(robot, 1, scene or scene_for([layout.spec]))
+        self._sim = BatchSim(robot, 1, scene_for([layout.spec]))
         self.reset(layout, seed)
 
     @property

@@ -52,33 +52,31 @@ class BlindWatch:
         return (Trust.HOLD, "position and heading are unknown") if estimate is None else (estimate.trust, estimate.why)
 
 
+OVERRUNS, GOOD_TICKS = 3, 10
+"""Ticks in a row that missed a deadline after which the robot waits, and ticks in time after which it goes on."""
+
+
 class OverrunWatch:
     """Notices a machine that does not keep up, and when it does again."""
 
-    def __init__(self, limit: int = 3, good_ticks: int = 10) -> None:
-        """
-        Args:
-            limit: ticks in a row that missed their deadline after which the robot waits.
-            good_ticks: ticks in a row in time after which it goes on.
-        """
-        self.limit, self.good_ticks = limit, good_ticks
-        self._good = good_ticks
+    def __init__(self) -> None:
+        self._good = GOOD_TICKS
         self._late = False
 
     def check(self, overruns_in_a_row: int) -> str | None:
         """Why to wait, or None; once per tick."""
-        if overruns_in_a_row >= self.limit:
+        if overruns_in_a_row >= OVERRUNS:
             self._late, self._good = True, 0
         elif self._late:
             self._good = 0 if overruns_in_a_row else self._good + 1
-            self._late = self._good < self.good_ticks
-        return f"{self.limit} overruns in a row" if self._late else None
+            self._late = self._good < GOOD_TICKS
+        return f"{OVERRUNS} overruns in a row" if self._late else None
 
 
 class PlanWatch:
     """Notices a planner that does not answer: first the robot slows down, then it waits."""
 
-    def __init__(self, slow_after: float = 0.3, hold_after: float = 1.0) -> None:
+    def __init__(self, slow_after: float, hold_after: float) -> None:
         """
         Args:
             slow_after: time for which a plan that has ended is followed at full speed [s].
@@ -119,19 +117,21 @@ class BlockedWatch:
         return ("no way to the goal" if waited > self.hold_after else None), waited > self.give_up_after
 
 
+SATURATED, WINDOW = 0.9, 2.0
+"""Share of the commands that lie at an actuator's limit, of those in so much time [s], at which the robot is helped."""
+
+
 class SaturationWatch:
     """Notices a skill that asks for all that the actuators can give, and goes on doing so."""
 
-    def __init__(self, action_dim: int, period: float, window: float = 2.0, share: float = 0.9) -> None:
+    def __init__(self, action_dim: int, period: float) -> None:
         """
         Args:
             action_dim: number of actuators.
             period: of the control loop [s].
-            window: time that is looked at [s].
-            share: of the commands in it that lie at an actuator's limit.
         """
-        self._counts: deque[int] = deque(maxlen=max(1, round(window / period)))
-        self._limit = share * (self._counts.maxlen or 1) * action_dim
+        self._counts: deque[int] = deque(maxlen=max(1, round(WINDOW / period)))
+        self._limit = SATURATED * (self._counts.maxlen or 1) * action_dim
         self._sum = 0
 
     def reset(self) -> None:
