@@ -16,6 +16,16 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.path import distances, polyline
 from hiernav.nav.sweep import sweep
 
+LEAST_M, WINDOW_S = 0.05, 1.5
+"""A robot is stuck that has moved less than so far [m] within so long [s]."""
+PATIENCE_S = 4.0
+"""The same, where the map has changed within `WINDOW_S`: the robot may wait for what is in its way to move on [s]."""
+TRY_S, WAYS = 0.5, 6
+"""How long a way out is tried [s], and how many of them are in one recovery."""
+REACH_M = 0.5
+"""A recovery ends this far from where it began [m]."""
+LIMIT, CLEAR_M = 3, 0.5
+"""Recoveries that are tried within so far [m] of where the first of them began."""
 _LEAST_FREE = 2
 """Waypoints of a way out that must be free for it to be tried before those that are blocked at once."""
 _DIMMED = 0.7
@@ -25,11 +35,11 @@ _DIMMED = 0.7
 class Recovery:
     """Gives robots that should move and do not a way out.
 
-    A robot is stuck if it has moved less than `least_m` within `window_s` although its plan leads farther away; where
-    the map has changed meanwhile, within `patience_s` too: it may wait for what is in its way to move on. It is then
-    shown one way out after the other, each for `try_s`; the first on which it moves by `least_m` it follows for as long
-    again, or until it is `reach_m` away, and plans anew. After `limit` recoveries of at most `ways` ways each without
-    coming `clear_m` away from where the first of them began, it is given up and keeps its plan.
+    A robot is stuck if it has moved less than `LEAST_M` within `WINDOW_S` although its plan leads farther away; where
+    the map has changed meanwhile, within `PATIENCE_S` too. It is then shown one way out after the other, each for
+    `TRY_S`; the first on which it moves by `LEAST_M` it follows for as long again, or until it is `REACH_M` away, and
+    plans anew. After `LIMIT` recoveries of at most `WAYS` ways each without coming `CLEAR_M` away from where the first
+    of them began, it is given up and keeps its plan.
 
     Each way leads from where the robot is at its turn. It is swept on the newest map at every step and ends before what
     it meets; if that is near, the turn is the next free one's. A robot that is free to no side is asked to stay.
@@ -41,26 +51,12 @@ class Recovery:
         given_up: (N,) bool.
     """
 
-    def __init__(
-        self,
-        num_rows: int,
-        control_period: float,
-        radius: float = 0.1,
-        window_s: float = 1.5,
-        patience_s: float = 4.0,
-        least_m: float = 0.05,
-        try_s: float = 0.5,
-        ways: int = 6,
-        reach_m: float = 0.5,
-        limit: int = 3,
-        clear_m: float = 0.5,
-    ) -> None:
+    def __init__(self, num_rows: int, control_period: float, radius: float = 0.1) -> None:
         """`radius` is that of the disc that must fit on the way out [m]."""
-        self.radius, self.least_m, self.reach_m, self.limit, self.clear_m = radius, least_m, reach_m, limit, clear_m
-        self.ways = ways
-        self._try = max(1, round(try_s / control_period))
-        self._window = max(1, round(window_s / control_period))
-        self._trail = np.full((num_rows, max(self._window, round(patience_s / control_period)), 2), np.nan)
+        self.radius = radius
+        self._try = max(1, round(TRY_S / control_period))
+        self._window = max(1, round(WINDOW_S / control_period))
+        self._trail = np.full((num_rows, max(self._window, round(PATIENCE_S / control_period)), 2), np.nan)
         self._all_rows = np.arange(num_rows)
         self._tick = np.zeros(num_rows, dtype=np.int64)
         self._map: list[OccupancyMap | None] = [None] * num_rows
@@ -124,11 +120,11 @@ class Recovery:
             if self._map[row] is not now:
                 self._map[row], self._mapped[row] = now, self._tick[row]
         # comparisons with NaN, where the window is not full or a position unknown, are False
-        still = distances(position, self._trail[rows, (tick - self._window) % length]) < self.least_m
+        still = distances(position, self._trail[rows, (tick - self._window) % length]) < LEAST_M
         if np.count_nonzero(still):
             patient = self._mapped[rows] > tick - self._window
             oldest = self._trail[rows, tick % length]  # the slot that is written next
-            still &= ~patient | (distances(position, oldest) < self.least_m)
+            still &= ~patient | (distances(position, oldest) < LEAST_M)
         self._trail[rows, tick % length] = position
         self._tick[rows] += 1
         if self._quiet and not np.count_nonzero(still):
@@ -137,9 +133,9 @@ class Recovery:
         ahead = distances(plan[:, -1], position)
         idle = self._ways_left[rows] == 0
         known = np.isfinite(pose).all(axis=1) & np.isfinite(plan).all(axis=(1, 2))
-        stuck = (still & (ahead > self.least_m) | self._asked[rows]) & idle & known
+        stuck = (still & (ahead > LEAST_M) | self._asked[rows]) & idle & known
         self._asked[rows] = False
-        self.given_up[rows] = stuck & (self._tries[rows] >= self.limit)
+        self.given_up[rows] = stuck & (self._tries[rows] >= LIMIT)
         for k in np.flatnonzero(~idle).tolist():
             self._go_on(int(rows[k]), position[k], occupancy[k])
         for k in np.flatnonzero(stuck & ~self.given_up[rows]).tolist():
@@ -169,7 +165,7 @@ class Recovery:
 
     def _forget(self, rows: np.ndarray, position: np.ndarray) -> None:
         """Recoveries count in one place alone."""
-        self._tries[rows[distances(position, self._place[rows]) > self.clear_m]] = 0
+        self._tries[rows[distances(position, self._place[rows]) > CLEAR_M]] = 0
 
     def _remember(self, row: int, position: np.ndarray) -> None:
         """One more recovery; the first one makes the place."""
@@ -178,9 +174,9 @@ class Recovery:
         self._tries[row] += 1
 
     def _begin(self, row: int, pose: np.ndarray, plan: np.ndarray, occupancy: OccupancyMap) -> None:
-        first = int(self._tries[row]) * self.ways  # go on where the last recovery in this place ended
+        first = int(self._tries[row]) * WAYS  # go on where the last recovery in this place ended
         self._bearings[row] = np.roll(ways_out(pose, plan, occupancy, self.radius)[0], -first)
-        self._spacing[row], self._ways_left[row] = _spacing(pose, plan), self.ways
+        self._spacing[row], self._ways_left[row] = _spacing(pose, plan), WAYS
         self._turn(row, pose[:2], len(plan), occupancy)
         self._began[row], self._trail[row] = pose[:2], np.nan
         self._remember(row, pose[:2])
@@ -189,10 +185,10 @@ class Recovery:
     def _go_on(self, row: int, position: np.ndarray, occupancy: OccupancyMap) -> None:
         """One more step of a recovery: the same way, the next one, or the end."""
         self._on_way[row] += 1
-        if np.linalg.norm(position - self._began[row]) > self.reach_m or self._on_way[row] >= 2 * self._try:
+        if np.linalg.norm(position - self._began[row]) > REACH_M or self._on_way[row] >= 2 * self._try:
             self._ways_left[row] = 0
         else:
-            tried = self._on_way[row] == self._try and np.linalg.norm(position - self._turned[row]) < self.least_m
+            tried = self._on_way[row] == self._try and np.linalg.norm(position - self._turned[row]) < LEAST_M
             if tried or not self._leads_on(row, position, occupancy):
                 self._bearings[row] = np.roll(self._bearings[row], -1)
                 self._ways_left[row] -= 1
@@ -212,7 +208,7 @@ class Recovery:
         """Whether what is left of the way is free, or asks to stay; it is made to end before what it meets."""
         way = self._way[row]
         # not so where the position is unknown
-        if not distances(way[-1], position) > self.least_m:
+        if not distances(way[-1], position) > LEAST_M:
             return True
         left = way[int(distances(way, position).argmin()) :]
         free = int(_free_waypoints(position, left[None], occupancy, self.radius)[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from puck import Listener, Puck, Scripted, driver_of, pilot_for
 
+from hiernav.nav import recovery as recovery_module
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.planners import StraightPlanner
 from hiernav.nav.recovery import Recovery
@@ -51,8 +52,10 @@ def test_a_robot_that_gets_free_goes_on():
     assert result.reached and 1 <= result.recoveries <= 3
 
 
-def test_a_way_out_ends_after_half_a_metre_however_fast():
-    recovery, plan = Recovery(1, 0.1, try_s=10.0, limit=1), np.full((1, 10, 2), 0.9)
+def test_a_way_out_ends_after_half_a_metre_however_fast(monkeypatch):
+    monkeypatch.setattr(recovery_module, "TRY_S", 10.0)
+    monkeypatch.setattr(recovery_module, "LIMIT", 1)
+    recovery, plan = Recovery(1, 0.1), np.full((1, 10, 2), 0.9)
     pose, moved, occupancy = np.zeros((1, 3)), [], empty_map((2.0, 2.0))
     for _ in range(30):
         if recovery(pose, plan, [occupancy]) is not plan:
