@@ -63,7 +63,8 @@ def bench_tick(arguments: argparse.Namespace) -> dict[str, Any]:
     from hiernav.nav.bundle import load_bundle
     from hiernav.runtime.clock import FakeClock
     from hiernav.runtime.driver import Driver
-    from hiernav.runtime.estimator import Estimator, EstimatorConfig
+    from hiernav.runtime.estimate import EstimatorConfig
+    from hiernav.runtime.estimator import Estimator
     from hiernav.runtime.pilot import Pilot
     from hiernav.runtime.policy import make_agent
     from hiernav.runtime.sim_robot import SimRobot

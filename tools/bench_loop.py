@@ -76,7 +76,8 @@ def measure(
     from hiernav.nav.bundle import load_bundle
     from hiernav.runtime.clock import MonotonicClock
     from hiernav.runtime.driver import Driver, DriverConfig
-    from hiernav.runtime.estimator import Estimator, EstimatorConfig
+    from hiernav.runtime.estimate import EstimatorConfig
+    from hiernav.runtime.estimator import Estimator
     from hiernav.runtime.guard import Guard
     from hiernav.runtime.observe import Event, Observer, TickRecord
     from hiernav.runtime.pilot import Pilot

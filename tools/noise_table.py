@@ -42,7 +42,8 @@ from hiernav.nav.goal import GOAL_RADIUS  # noqa: E402
 from hiernav.runtime.clock import FakeClock  # noqa: E402
 from hiernav.runtime.delayed_planner import DelayedPlanner  # noqa: E402
 from hiernav.runtime.driver import Driver  # noqa: E402
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig  # noqa: E402
+from hiernav.runtime.estimate import Estimate, EstimatorConfig  # noqa: E402
+from hiernav.runtime.estimator import Estimator  # noqa: E402
 from hiernav.runtime.guard import Guard  # noqa: E402
 from hiernav.runtime.noise import EXACT  # noqa: E402
 from hiernav.runtime.pilot import Pilot  # noqa: E402

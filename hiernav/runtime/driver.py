@@ -16,7 +16,8 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import TerminationReason
 from hiernav.runtime.clock import Clock
 from hiernav.runtime.collision import time_to_collision
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig, Trust
+from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
 from hiernav.runtime.observe import Audience, Observer, TickRecord

@@ -16,8 +16,6 @@ from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarF
 from hiernav.runtime.robot import ABSURD, VECTOR_SENSORS, SensorFrame
 from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
-__all__ = ["Estimate", "Estimator", "EstimatorConfig", "Trust"]
-
 MAX_RATE = 100.0
 """No robot turns faster than this [rad/s]."""
 EARLY = 0.1

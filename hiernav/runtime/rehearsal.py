@@ -15,7 +15,8 @@ from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.option import HierarchicalAgent, WaypointOption
 from hiernav.nav.planners import StraightPlanner
 from hiernav.runtime.collision import time_to_collision
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.robot import SensorFrame

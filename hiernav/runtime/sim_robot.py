@@ -13,15 +13,13 @@ import numpy as np
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime.clock import Clock, MonotonicClock
-from hiernav.runtime.noise import EXACT, SensorNoise
+from hiernav.runtime.noise import SensorNoise
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog, SensorFrame, Truth
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 from hiernav.sim.scene import scene_for
 from hiernav.sim.worlds import sample_layout
-
-__all__ = ["EXACT", "SensorNoise", "SimRobot", "make"]
 
 
 def make(

@@ -13,7 +13,8 @@ from hiernav.nav.option import HierarchicalAgent, Planner, TerminationReason, Wa
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.delayed_planner import DelayedPlanner
 from hiernav.runtime.driver import Driver
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Decision, Pilot
 from hiernav.runtime.robot import SensorFrame

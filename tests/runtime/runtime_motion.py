@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.planar_filter import wrap
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 

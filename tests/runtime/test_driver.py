@@ -16,7 +16,8 @@ from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
 from hiernav.runtime.account import Account, Episode
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver, DriverConfig
-from hiernav.runtime.estimator import Estimate, Estimator, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.robot import RobotGone, SensorFrame

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_motion import FIX_SIGMA, estimator_for, follow, frames, recorded
 
-from hiernav.runtime.estimator import Estimator, EstimatorConfig, Trust
+from hiernav.runtime.estimate import EstimatorConfig, Trust
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.robot import SensorFrame
 
 ROBOTS = ("point", "car", "doggo")

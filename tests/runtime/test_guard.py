@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from shipped import ROOT
 
 from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.noise import EXACT
 from hiernav.runtime.settings import load_settings
-from hiernav.runtime.sim_robot import EXACT, SimRobot
+from hiernav.runtime.sim_robot import SimRobot
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout

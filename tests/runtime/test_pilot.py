@@ -8,7 +8,7 @@ from shipped import open_shipped
 
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.planners import StraightPlanner
-from hiernav.runtime.estimator import Estimate
+from hiernav.runtime.estimate import Estimate
 from hiernav.runtime.pilot import Decision
 from hiernav.runtime.policy import make_agent
 

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from puck import Puck
 from shipped import ROOT
 
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.estimate import EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import RealtimeConfig

@@ -17,12 +17,12 @@ from hiernav.nav.option import PlanQuery
 from hiernav.nav.recovery import Recovery
 from hiernav.runtime import messages
 from hiernav.runtime.log_reader import LogError, RunLog
+from hiernav.runtime.noise import SensorNoise
 from hiernav.runtime.observe import Observer, TickRecord
 from hiernav.runtime.policy import OnnxSkill
 from hiernav.runtime.recorder import Recorder
 from hiernav.runtime.replay import ASKED, Replay, _Asked, _Recorded, _same, _texts
 from hiernav.runtime.robot import SensorFrame
-from hiernav.runtime.sim_robot import SensorNoise
 from hiernav.runtime.supervisor import Mode
 
 

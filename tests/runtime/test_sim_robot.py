@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hiernav.runtime.clock import FakeClock
+from hiernav.runtime.noise import EXACT, SensorNoise
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog
-from hiernav.runtime.sim_robot import EXACT, SensorNoise, SimRobot
+from hiernav.runtime.sim_robot import SimRobot
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import ROBOTS, get_robot
 from hiernav.sim.worlds import sample_layout

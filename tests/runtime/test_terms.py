@@ -10,7 +10,8 @@ from puck import GOAL, PERIOD, Listener, Puck, Scripted, driver_of
 from recorded_drive import BUNDLE, Memory, drive
 
 from hiernav.nav.bundle import load_bundle
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.estimate import EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.policy import make_agent
 from hiernav.runtime.rehearsal import Rehearsal

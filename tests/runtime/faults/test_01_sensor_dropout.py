@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from runtime_motion import estimator_for, follow, frames, recorded
 
-from hiernav.runtime.estimator import Trust
+from hiernav.runtime.estimate import Trust
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 
 BEGIN = 1.5

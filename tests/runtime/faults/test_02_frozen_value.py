@@ -10,7 +10,7 @@ import pytest
 from runtime_motion import Motion, estimator_for, follow, frames, recorded
 
 from hiernav.runtime import freshness
-from hiernav.runtime.estimator import Trust
+from hiernav.runtime.estimate import Trust
 from hiernav.runtime.freshness import SensorWatch, TermWatch
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 

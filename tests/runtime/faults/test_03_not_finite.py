@@ -10,7 +10,7 @@ import pytest
 from puck import GOAL, Puck, Scripted, driver_of
 from runtime_motion import FIX_SIGMA, estimator_for, follow, frames, recorded
 
-from hiernav.runtime.estimator import Trust
+from hiernav.runtime.estimate import Trust
 from hiernav.runtime.robot import VECTOR_SENSORS, SensorFrame
 
 

@@ -13,7 +13,7 @@ from puck import GOAL, Listener, Puck, Scripted, driver_of, map_with, pilot_for
 from runtime_motion import estimator_for, frames, recorded
 
 from hiernav.nav.planners import StraightPlanner
-from hiernav.runtime.estimator import Estimate, Trust
+from hiernav.runtime.estimate import Estimate, Trust
 from hiernav.runtime.pilot import Decision
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode

@@ -22,7 +22,8 @@ from hiernav.nav.occupancy import empty_map
 from hiernav.nav.option import HierarchicalAgent, WaypointOption
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.driver import Driver
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.estimate import EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.process_planner import ProcessPlanner
 

@@ -13,8 +13,9 @@ from shipped import ROOT
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner, VerifiedPlanner
 from hiernav.runtime.collision import time_to_collision
 from hiernav.runtime.guard import Guard, GuardConfig
+from hiernav.runtime.noise import EXACT
 from hiernav.runtime.settings import load_settings
-from hiernav.runtime.sim_robot import EXACT, SimRobot
+from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.supervisor import Mode
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from puck import GOAL, Listener, Puck, Scripted, driver_of
 
-from hiernav.runtime.estimator import Estimator, EstimatorConfig
+from hiernav.runtime.estimate import EstimatorConfig
+from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
