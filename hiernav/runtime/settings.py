@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 
@@ -30,13 +30,7 @@ class Settings:
     """Of simulated sensors."""
 
 
-_SECTIONS: dict[str, Any] = {
-    "driver": DriverConfig,
-    "estimator": EstimatorConfig,
-    "guard": GuardConfig,
-    "realtime": RealtimeConfig,
-    "noise": SensorNoise,
-}
+_SECTIONS: dict[str, Any] = get_type_hints(Settings)
 
 
 def load_settings(
