@@ -7,10 +7,9 @@ import gc
 import math
 import os
 import resource
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 PR_SET_TIMERSLACK = 29
 MCL_CURRENT = 1
@@ -45,12 +44,6 @@ class RealtimeConfig:
             raise ValueError(f"RealtimeConfig.fifo_priority = {self.fifo_priority} must be 1 to 99, or null")
         if self.cpus is not None and (not self.cpus or min(self.cpus) < 0):
             raise ValueError(f"RealtimeConfig.cpus = {list(self.cpus)} must be numbers of CPUs from 0, at least one")
-
-
-def realtime_of(values: Mapping[str, Any]) -> RealtimeConfig:
-    """A configuration from its `asdict`, be it by way of JSON."""
-    cpus = values["cpus"]
-    return RealtimeConfig(**{**values, "cpus": None if cpus is None else tuple(cpus)})
 
 
 def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:

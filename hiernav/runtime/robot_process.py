@@ -22,12 +22,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.gathering import Gathering
 from hiernav.runtime.mailbox import Mailbox, mapped
-from hiernav.runtime.realtime import RealtimeConfig, realtime_of, request_realtime
+from hiernav.runtime.realtime import RealtimeConfig, request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
 from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 
@@ -50,7 +51,7 @@ def main() -> None:
     try:
         robot = make_robot(settings["robot"], settings["arguments"])
         leave_signals_to_parent()  # once more: the robot's driver may have seen to them
-        adapter = Adapter(robot, news, calls, descriptor, realtime_of(settings["realtime"]))
+        adapter = Adapter(robot, news, calls, descriptor, msgspec.convert(settings["realtime"], RealtimeConfig))
     except BaseException as error:
         if _frames(error):
             _tell([error])
