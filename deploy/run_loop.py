@@ -46,7 +46,7 @@ from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.runtime.account import KEPT, Account, FaultWatch, GoalWatch
-from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock
+from hiernav.runtime.clock import Clock, FakeClock, MonotonicClock, process_age
 from hiernav.runtime.control import ControlServer, default_socket, parse_point, tell
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.dry_run import print_report, report
@@ -627,15 +627,6 @@ def _layout(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | Non
     if start_known and not is_solvable(occupancy, layout.start[:2], goal, spec.radius):
         raise GoalError(f"--goal {goal[0]:g},{goal[1]:g} cannot be reached from the start in seed {seed}")
     return replace(layout, goal=goal)
-
-
-def process_age() -> float | None:
-    """Seconds since this process was started, interpreter and imports included; None where /proc does not tell."""
-    try:
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        return time.clock_gettime(time.CLOCK_BOOTTIME) - int(fields[19]) / os.sysconf("SC_CLK_TCK")
-    except (OSError, AttributeError, ValueError, IndexError):
-        return None
 
 
 def _given_goal(arguments: argparse.Namespace) -> np.ndarray | None:

@@ -74,7 +74,7 @@ def measure(
 ) -> dict[str, Any]:
     """Drive for some time; all figures in seconds, megabytes and shares."""
     from hiernav.nav.bundle import load_bundle
-    from hiernav.runtime.clock import MonotonicClock
+    from hiernav.runtime.clock import MonotonicClock, process_age
     from hiernav.runtime.driver import Driver, DriverConfig
     from hiernav.runtime.estimate import EstimatorConfig
     from hiernav.runtime.estimator import Estimator
@@ -202,12 +202,6 @@ def hog() -> None:
 def resident() -> float:
     """Of this process [MB]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def process_age() -> float:
-    """Since this process was started [s]."""
-    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - int(fields[19]) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":
