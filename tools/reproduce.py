@@ -29,6 +29,7 @@ from types import FrameType
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from bad_input import whole  # noqa: E402
 from rich.console import Console  # noqa: E402
 
 from hiernav.reproduce.cells import TRAINING, Places  # noqa: E402
@@ -59,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--list", action="store_true", help="run nothing: show every cell")
     parser.add_argument("--only", nargs="+", default=[], metavar="WHAT", help="experiments, cells, or patterns of them")
-    parser.add_argument("--seeds", type=_positive, metavar="N", help="of every training (5; 3 of the doggo's, of "
+    parser.add_argument("--seeds", type=whole(), metavar="N", help="of every training (5; 3 of the doggo's, of "
                         "Table II and of ablations of reward, curriculum, critics; 1 of the others)")  # fmt: skip
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS, help="(all)")
     parser.add_argument("--no-training", action="store_true", help="leave out what trains, or needs a training")
@@ -102,13 +103,6 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(asdict(tally), indent=1))
     print_tally(notes if arguments.json else screen, tally)
     return INTERRUPTED if tally.stopped else 1 if tally.failed else 0
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
-    return value
 
 
 def _seconds(text: str) -> float:
