@@ -325,12 +325,12 @@ class Episodes:
             clock, robot = FakeClock(), simulated
             self._reset = lambda layout: simulated.reset(layout, layout.seed)
         require_fit(bundle, robot)
-        rehearsal = None if arguments.view is None else FaultyRobot(robot, arguments.seed)
+        faulty = None if arguments.view is None else FaultyRobot(robot, arguments.seed)
         limits = [limit for limit in (settings.guard.slew_limit, bundle.manifest.guard.slew_limit) if limit is not None]
         guard = replace(settings.guard, slew_limit=min(limits, default=None))
         driver = settings.driver
         self.driver = Driver(
-            rehearsal or robot,
+            faulty or robot,
             Pilot(make_agent(bundle, driver.robot_radius, driver.goal_radius, link, driver.predict), link),
             lambda stamp: self.layout.occupancy(stamp),
             clock,
@@ -350,7 +350,7 @@ class Episodes:
             self.server = ControlServer(self.driver, arguments.control or default_socket()) if serves else None
             if self.server is not None:
                 opened.callback(_hang_up, self.server)
-            self.page = None if rehearsal is None else _open_page(arguments, self.driver, rehearsal, spec)
+            self.page = None if faulty is None else _open_page(arguments, self.driver, faulty, spec)
             if self.page is not None:
                 opened.callback(self.page.close)
             self.recorder = _open_recorder(arguments, self.driver, bundle, spec)
@@ -389,7 +389,7 @@ class Episodes:
             if self.interrupted:
                 break
             self.goals.seed = layout.seed
-            self._tell(layout, self.driver.run(layout.goal))
+            self._say_ended(layout, self.driver.run(layout.goal))
             if self.driver.interrupted or self.driver.gone or self.driver.supervisor.latched and self.arguments.adapter:
                 break
 
@@ -438,8 +438,8 @@ class Episodes:
         others = (self.goals, self.recorder, self.page)
         self.driver.audience.observers = [drive, self.faults, *filter(None, others)]
 
-    def _tell(self, layout: Layout, result: RunResult) -> None:
-        """Account for a drive, and say what has come of it."""
+    def _say_ended(self, layout: Layout, result: RunResult) -> None:
+        """Account for a drive, and say how it ended."""
         self.goals.take_result()
         text = f"seed {layout.seed}: {result.reason} after {result.steps} steps ({result.seconds:.1f} s)"
         collisions = self.account.episodes[-1].collisions
@@ -494,15 +494,15 @@ class Episodes:
             if drive.path:
                 title = f"{layout.spec}, seed {layout.seed}: {end}"
                 file = self.out / f"drive-{layout.seed}.png"
-                partial = file.with_name(file.name + ".part")
+                unfinished = file.with_name(file.name + ".part")
                 try:
-                    drive.draw(layout, partial, title)
-                    partial.replace(file)
+                    drive.draw(layout, unfinished, title)
+                    unfinished.replace(file)
                 except OSError as error:
                     _warn(file, error)
                 finally:
                     with suppress(OSError):
-                        partial.unlink()
+                        unfinished.unlink()
 
 
 def _hang_up(server: ControlServer) -> None:
@@ -590,11 +590,11 @@ def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle
     return Recorder(arguments.record, about.metadata())
 
 
-def _open_page(arguments: argparse.Namespace, driver: Driver, rehearsal: FaultyRobot, spec: RobotSpec) -> ViewerLink:
+def _open_page(arguments: argparse.Namespace, driver: Driver, faulty: FaultyRobot, spec: RobotSpec) -> ViewerLink:
     from hiernav.view.link import ViewerLink
 
     # nobody rehearses faults with a robot that can hurt someone
-    faults = {} if arguments.adapter else {name: partial(rehearsal.inject, name) for name in FAULTS}
+    faults = {} if arguments.adapter else {name: partial(faulty.inject, name) for name in FAULTS}
     title = f"hiernav: {spec.name} in {arguments.world}"
     page = ViewerLink(driver, driver.config.robot_radius, driver.config.goal_radius, title, arguments.view, faults)
     print(f"live page: {page.url}", file=sys.stderr if arguments.json == "-" else sys.stdout, flush=True)
