@@ -75,7 +75,8 @@ def measure(
     """Drive for some time; all figures in seconds, megabytes and shares."""
     from hiernav.nav.bundle import load_bundle
     from hiernav.runtime.clock import MonotonicClock, process_age
-    from hiernav.runtime.driver import Driver, DriverConfig
+    from hiernav.runtime.driver import Driver
+    from hiernav.runtime.driver_config import DriverConfig
     from hiernav.runtime.estimate import EstimatorConfig
     from hiernav.runtime.estimator import Estimator
     from hiernav.runtime.guard import Guard

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import msgspec
 
 from hiernav.decode import ConfigError, parse_yaml
-from hiernav.runtime.driver import DriverConfig
+from hiernav.runtime.driver_config import DriverConfig
 from hiernav.runtime.estimate import EstimatorConfig
 from hiernav.runtime.guard import GuardConfig
 from hiernav.runtime.noise import SensorNoise

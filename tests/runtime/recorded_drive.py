@@ -15,7 +15,8 @@ from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.runtime.about import About
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.delayed_planner import DelayedPlanner
-from hiernav.runtime.driver import Driver, DriverConfig, RunResult
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.driver_config import DriverConfig
 from hiernav.runtime.estimate import EstimatorConfig
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import GuardConfig
@@ -25,6 +26,7 @@ from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import load_policies, make_agent, make_planner
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
+from hiernav.runtime.trip import RunResult
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout

@@ -15,7 +15,8 @@ from rich.console import Console
 from hiernav.nav.occupancy import OccupancyMap, draw_discs, empty_map
 from hiernav.runtime.account import Account, Episode
 from hiernav.runtime.clock import FakeClock
-from hiernav.runtime.driver import Driver, DriverConfig
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.driver_config import DriverConfig
 from hiernav.runtime.estimate import Estimate, EstimatorConfig
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard, GuardConfig

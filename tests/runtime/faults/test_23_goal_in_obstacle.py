@@ -8,7 +8,7 @@ from puck import Puck, driver_of, map_with, pilot_for
 
 from hiernav.nav.goal import GoalRefused, place_goal
 from hiernav.nav.planners import ShortestPathPlanner
-from hiernav.runtime.driver import DriverConfig
+from hiernav.runtime.driver_config import DriverConfig
 
 
 def drive(occupancy, goal, tolerance=0.3):

@@ -9,7 +9,7 @@ from hiernav.nav import recovery as recovery_module
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.planners import StraightPlanner
 from hiernav.nav.recovery import Recovery
-from hiernav.runtime.driver import DriverConfig
+from hiernav.runtime.driver_config import DriverConfig
 from hiernav.runtime.supervisor import Mode
 
 PERIOD, GOAL = 0.02, np.array([1.5, 0.0])
