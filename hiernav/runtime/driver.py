@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -24,6 +24,7 @@ from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
 from hiernav.runtime.observe import Audience, Observer, TickRecord
 from hiernav.runtime.pilot import Decision, Pilot
 from hiernav.runtime.rehearsal import Rehearsal
+from hiernav.runtime.requests import Requests
 from hiernav.runtime.robot import Robot, RobotGone, SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode, Supervisor
 from hiernav.runtime.terms import TermHold
@@ -37,8 +38,6 @@ FLUSH_SECONDS = 1.0
 """What observers are given to bring their data to safety once the robot is braked [s]."""
 MAX_SATURATED = 3
 """Recoveries from a saturated action on the way to one goal."""
-REQUESTS = 16
-"""Commands that are taken in one tick; of more, the oldest are lost. An emergency stop is not among them."""
 
 log = logging.getLogger(__name__)
 
@@ -145,14 +144,12 @@ class Driver:
         """Whether the robot was seen to stand at the end of the last run."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
-        self._requests: deque[tuple[Ticket, Callable[[float], None]]] = deque()
-        self._stops: deque[Ticket] = deque()
+        self._requests = Requests()
         self._trip: Trip | None = None
         self._ended: Trip | None = None
         self._last_trip: Trip | None = None
         self._estimate: Estimate | None = None
         self._paused = self._serving = False
-        self._stop_wanted: str | None = None
         self._held_since = 0.0
         self._run = self._new_run()
 
@@ -196,44 +193,27 @@ class Driver:
             ValueError: the goal is not two finite numbers.
         """
         goal, ticket = _checked_goal(goal), Ticket()
-        return self._ask(lambda now: self._start_trip(goal, None, now, ticket), ticket)
+        return self._requests.add(lambda now: self._start_trip(goal, None, now, ticket), ticket)
 
     def cancel(self) -> Ticket:
         """Give up the present goal, and stop."""
-        return self._ask(lambda now: self._end_trip("cancelled", now))
+        return self._requests.add(lambda now: self._end_trip("cancelled", now))
 
     def pause(self) -> Ticket:
         """Wait, braked, until `resume`."""
-        return self._ask(lambda now: setattr(self, "_paused", True))
+        return self._requests.add(lambda now: setattr(self, "_paused", True))
 
     def resume(self) -> Ticket:
         """Go on after `pause`."""
-        return self._ask(lambda now: setattr(self, "_paused", False))
+        return self._requests.add(lambda now: setattr(self, "_paused", False))
 
     def estop(self, why: str = "emergency stop") -> Ticket:
         """Brake, and stay braked until `acknowledge`."""
-        ticket = Ticket()
-        self._stops.append(ticket)
-        self._stop_wanted = why
-        return ticket
+        return self._requests.add_stop(why)
 
     def acknowledge(self) -> Ticket:
         """The cause of a fault or of an emergency stop is gone. The robot does not move before it gets a goal."""
-        return self._ask(self._acknowledge)
-
-    def _ask(self, request: Callable[[float], None], ticket: Ticket | None = None) -> Ticket:
-        """Have something done at the beginning of the next tick; of too many such requests, the oldest are dropped."""
-        ticket = ticket or Ticket()
-        while len(self._requests) >= REQUESTS:
-            self._drop_oldest(f"more than {REQUESTS} commands came within one tick")
-        self._requests.append((ticket, request))
-        return ticket
-
-    def _drop_oldest(self, why: str) -> None:
-        try:
-            self._requests.popleft()[0].drop(why)
-        except IndexError:  # the loop has just taken them
-            pass
+        return self._requests.add(self._acknowledge)
 
     def quit(self) -> None:
         """End `run` or `serve` after the present tick."""
@@ -263,8 +243,7 @@ class Driver:
         now = self.clock.now()
         if self.supervisor.mode is not Mode.INIT:
             self.supervisor.change(Mode.INIT, "new run", now)
-        while self._requests:
-            self._drop_oldest("the loop had not begun")
+        self._requests.drop_all("the loop had not begun")
         self._trip, self._ended, self._last_trip, self._paused = None, None, None, False
         self.gone = None
         self._estimate = None
@@ -412,18 +391,7 @@ class Driver:
 
     def _take_requests(self, now: float) -> None:
         self.audience.tell(lambda observer: observer.make_requests())
-        for _ in range(len(self._requests)):
-            try:
-                ticket, request = self._requests.popleft()
-            except IndexError:  # somebody else has just dropped it for a newer one
-                break
-            request(now)
-            ticket.taken = self.loop.ticks
-        if self._stop_wanted is not None:
-            self._estop(self._stop_wanted, now)
-            self._stop_wanted = None
-            while self._stops:
-                self._stops.popleft().taken = self.loop.ticks
+        self._requests.take(now, self.loop.ticks, self._estop)
 
     def _get_ready(self, estimate: Estimate, occupancy: OccupancyMap, now: float) -> None:
         """INIT -> READY -> ARMED, as far as there is a goal that can be driven to."""

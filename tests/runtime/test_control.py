@@ -19,7 +19,8 @@ from puck import Puck, driver_of
 from hiernav.runtime import control
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.control import ControlServer, obey, tell
-from hiernav.runtime.driver import REQUESTS, Driver
+from hiernav.runtime.driver import Driver
+from hiernav.runtime.requests import LIMIT
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
 
@@ -141,7 +142,7 @@ def test_a_goal_that_a_stop_overtakes_is_refused():
 
 
 def test_commands_that_are_too_many_for_a_tick_are_told_so():
-    first, *others = answers_to("pause", *["goal 1.9,0"] * REQUESTS)
+    first, *others = answers_to("pause", *["goal 1.9,0"] * LIMIT)
     assert first["taken"] is False and "16 commands" in str(first["error"])
     assert all("taken" not in other for other in others)
 
@@ -155,7 +156,7 @@ def test_a_flood_of_commands_from_other_threads_is_no_fault():
 
     class Commanded(Puck):
         def read(self) -> SensorFrame:
-            driver._requests = Flooded()
+            driver._requests._waiting = Flooded()
             if self.log.count("read") == 20:
                 driver.quit()
             return super().read()

@@ -127,7 +127,7 @@ MUTANTS = (
            "for _ in range(10**9):", "tests/view/test_link.py"),
     Mutant("stop in a flood from the page", "hiernav/view/commands.py", 'if command.kind == "estop":', "if False:",
            "tests/view/test_link.py"),
-    Mutant("limit of requests", f"{R}/driver.py", "while len(self._requests) >= REQUESTS:", "while False:",
+    Mutant("limit of requests", f"{R}/requests.py", "while len(self._waiting) >= LIMIT:", "while False:",
            f"{F}/test_29_viewer_stalls.py"),
     Mutant("what became of a goal", f"{R}/driver.py", "ticket.trip = self._trip", "pass", f"{T}/test_control.py"),
     Mutant("a command that nobody takes", f"{R}/control.py", "if ticket.taken is None:", "if False:",

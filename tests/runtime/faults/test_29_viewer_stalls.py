@@ -10,8 +10,8 @@ import pytest
 from page_stub import link_to
 from puck import GOAL, Listener, Puck, Scripted, driver_of
 
-from hiernav.runtime.driver import REQUESTS
 from hiernav.runtime.observe import TickRecord
+from hiernav.runtime.requests import LIMIT
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
 
@@ -162,6 +162,6 @@ def test_a_flood_of_goals_leaves_the_newest_and_an_emergency_stop_gets_through()
 
     driver._step = step
     driver.serve()
-    assert max(waiting) <= REQUESTS
+    assert max(waiting) <= LIMIT
     assert driver.supervisor.mode is Mode.ESTOP and driver.supervisor.fault == "pressed"
     assert robot.log[-1] == "brake" and driver.last_result.reason in ("estop", "changed")
