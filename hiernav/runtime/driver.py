@@ -130,7 +130,7 @@ class Driver:
         self.config = config or DriverConfig()
         self.timer = TickTimer(SECTIONS)
         self.audience = Audience(observers)
-        self.supervisor = Supervisor(lambda now, mode, why: self._emit("mode", why, now, mode=mode.value))
+        self.supervisor = Supervisor(lambda now, mode, why: self.audience.emit("mode", why, now, mode=mode.value))
         prepare = self._rehearse if 0.0 < 4.0 * rehearsal <= robot.control_period else None
         self.loop = FixedRateLoop(clock, robot.control_period, self._tick, robot.brake, prepare=prepare, lead=rehearsal)
         self._rehearsal: Rehearsal | None = None
@@ -138,8 +138,10 @@ class Driver:
         """Whether SIGINT, SIGTERM or SIGHUP arrived in the last run, be it while the robot was stopping at its goal."""
         self.gone: str | None = None
         """Why the last run ended without anybody's wish: the robot cannot be read any more (`RobotGone`)."""
+        self.last_trip: Trip | None = None
+        """The goal that ended last, whether the robot has been seen to stand since or not."""
         self.last_result: RunResult | None = None
-        """Of the goal that ended last."""
+        """What came of it, once the robot was seen to stand, or not to, or drives to another goal."""
         self.stopped = True
         """Whether the robot was seen to stand at the end of the last run."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
@@ -147,7 +149,6 @@ class Driver:
         self._requests = Requests()
         self._trip: Trip | None = None
         self._ended: Trip | None = None
-        self._last_trip: Trip | None = None
         self._estimate: Estimate | None = None
         self._paused = self._serving = False
         self._held_since = 0.0
@@ -230,11 +231,6 @@ class Driver:
         return self._paused
 
     @property
-    def last_trip(self) -> Trip | None:
-        """The goal that ended last, whether the robot has been seen to stand since or not."""
-        return self._last_trip
-
-    @property
     def estimate(self) -> Estimate | None:
         """The newest."""
         return self._estimate
@@ -244,7 +240,7 @@ class Driver:
         if self.supervisor.mode is not Mode.INIT:
             self.supervisor.change(Mode.INIT, "new run", now)
         self._requests.drop_all("the loop had not begun")
-        self._trip, self._ended, self._last_trip, self._paused = None, None, None, False
+        self._trip, self._ended, self.last_trip, self._paused = None, None, None, False
         self.gone = None
         self._estimate = None
         self._run = self._new_run()
@@ -413,7 +409,7 @@ class Driver:
             self._held_since = now
         if estimate.restarts != self._run.restarts:
             self._run.restarts = estimate.restarts
-            self._emit("plan", "the position was found anew: the plan is void", now)
+            self.audience.emit("plan", "the position was found anew: the plan is void", now)
             self.pilot.drop()
 
     def _is_over(self, trip: Trip, estimate: Estimate, occupancy: OccupancyMap, now: float) -> bool:
@@ -536,14 +532,14 @@ class Driver:
         """Take on a goal in the place of the present one; the robot keeps moving if the planner answers at once."""
         if self.supervisor.latched:
             mode, fault = self.supervisor.mode.value, self.supervisor.fault
-            self._emit("goal", f"refused in {mode}: {fault}", now)
+            self.audience.emit("goal", f"refused in {mode}: {fault}", now)
             if ticket is not None:
                 ticket.refuse(mode, f"no goal is taken before {mode} is acknowledged: {fault}")
             return
         self._end_trip("changed", now)
         if self._ended is not None:
             self.last_result = self._result(self._ended, stopped=False)
-        self._emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
+        self.audience.emit("goal", f"{goal[0]:g}, {goal[1]:g}", now, x=float(goal[0]), y=float(goal[1]))
         self._run.blind.renew(now)
         before = self.guard.counts.copy(), self.estimator.counts.copy(), self._planner_counts()
         self._run.no_way = BlockedWatch(0.0, self.config.no_way_at_start)
@@ -566,8 +562,8 @@ class Driver:
         if supervisor.mode in (Mode.ARMED, Mode.RUNNING, Mode.HOLD, Mode.RECOVERING):
             supervisor.change(Mode.READY, reason, now)
         self._trip, self._ended = None, trip
-        self._last_trip = trip
-        self._emit("end", detail or reason, now, reason=reason, steps=trip.steps, seconds=trip.seconds)
+        self.last_trip = trip
+        self.audience.emit("end", detail or reason, now, reason=reason, steps=trip.steps, seconds=trip.seconds)
 
     def _check_stop(self, estimate: Estimate | None, now: float) -> None:
         """Follow a robot that was braked until it stands; one that does not stop is a fault."""
@@ -576,7 +572,7 @@ class Driver:
         stands = self._run.standing.check(estimate, now, *self._measured())
         if stands is None:
             return
-        self._emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
+        self.audience.emit("stop", "the robot stands" if stands else "the robot does not stop", now, stands=stands)
         if stands:
             self._run.must_stand = False
         else:
@@ -596,7 +592,7 @@ class Driver:
 
     def _fail(self, why: str, now: float) -> None:
         if self.supervisor.fail(why, now):
-            self._emit("fault", why, now)
+            self.audience.emit("fault", why, now)
         self._end_trip("fault", now, why)
 
     def _estop(self, why: str, now: float) -> None:
@@ -614,9 +610,6 @@ class Driver:
         self.estimator.renew()
         self._run.standing.begin(now)
         self._run.must_stand = True
-
-    def _emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
-        self.audience.emit(kind, text, now, **values)
 
     def _show(self, now: float) -> None:
         """Tell of a tick, as far as it came, unless that was done."""
