@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import NamedTuple
@@ -13,6 +13,7 @@ import numpy as np
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch, TermWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
+from hiernav.runtime.position_history import PositionHistory
 from hiernav.runtime.robot import ABSURD, VECTOR_SENSORS, SensorFrame
 from hiernav.runtime.tilt import Quaternion, TiltFilter, Vector, dot, level_axes, rotation_between
 
@@ -97,7 +98,7 @@ class Estimator:
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}
-        self._history: deque[list[float]] = deque()
+        self._history = PositionHistory(config.history)
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
@@ -148,7 +149,7 @@ class Estimator:
             forward, left = level_axes(self._tilt.up)
             self._correct_yaw(field, forward, left)
             self._correct_velocity(readings["velocimeter"], forward, left)
-            self._remember()
+            self._history.add(self._stamp, self._filter.x[X], self._filter.x[Y])
             self._take_fix(frame)
         return self._estimate() if self.ready else None
 
@@ -315,12 +316,6 @@ class Estimator:
             self._filter.replace(VELOCITY, (ahead, aside), variance)
         self._accept("velocimeter", self._stamp)
 
-    def _remember(self) -> None:
-        x, y = self._filter.x[:2]
-        self._history.append([self._stamp, x, y])
-        while self._history[0][0] < self._stamp - self.config.history:
-            self._history.popleft()
-
     def _take_fix(self, frame: SensorFrame) -> None:
         """Use the fix that this frame shows for the first time, and one that came before its time."""
         if self._early is not None and self._early[0] <= self._stamp + 1e-9:
@@ -345,7 +340,7 @@ class Estimator:
 
     def _correct_position(self, fix: list[float], stamp: float, shown_again: bool) -> None:
         """Take in a fix measured at `stamp` [s]; `shown_again`: it may be the last one, under its frame's stamp."""
-        if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or stamp < self._history[0][0]:
+        if not stamp > self._fix_stamp or stamp > self._stamp + 1e-9 or not self._history.reaches(stamp):
             self.counts["stale_fix"] += 1
             return
         self._fix_stamp = stamp
@@ -354,43 +349,25 @@ class Estimator:
             self.counts["position_fix_frozen"] += 1
             self._flaws["position_fix"] = "repeats itself"
             return
-        then = self._position_at(stamp)
+        then = self._history.at(stamp)
         miss = (fix[0] - then[0], fix[1] - then[1])
         variance = self.config.fix_sigma**2
         x, y = self._filter.x[:2]
         first, self._has_position = not self._has_position, True
         if not first and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
-            self._shift_history(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
+            self._history.shift(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
             self._confirm("position_fix", fix, self.config.fix_hold_after if shown_again else 0.0)
         else:
             unsure = "position_fix" in self._unsure
             if not (first or unsure or self._reject("position_fix", miss)):
                 return
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
-            self._shift_history(-math.inf, *miss)
+            self._history.shift(-math.inf, *miss)
             if first:
                 self._doubt("position_fix", fix)
             elif unsure and not self._agrees_roughly("position_fix", fix, miss):
                 return
         self._accept("position_fix", stamp)
-
-    def _position_at(self, stamp: float) -> tuple[float, float]:
-        """Where the filter has the robot at `stamp`, which lies within the history [m]."""
-        later = self._history[-1]
-        for entry in reversed(self._history):
-            if entry[0] <= stamp:
-                share = (stamp - entry[0]) / (later[0] - entry[0]) if later is not entry else 0.0
-                return entry[1] + share * (later[1] - entry[1]), entry[2] + share * (later[2] - entry[2])
-            later = entry
-        return later[1], later[2]
-
-    def _shift_history(self, stamp: float, dx: float, dy: float) -> None:
-        """Let the past know of a correction, so that the next late fix is not compared with what is already mended."""
-        for entry in reversed(self._history):
-            if entry[0] < stamp:
-                break
-            entry[1] += dx
-            entry[2] += dy
 
     def _accept(self, sensor: str, stamp: float) -> None:
         """A measurement taken at `stamp` [s] was used."""
@@ -401,7 +378,7 @@ class Estimator:
         """Count a rejected measurement.
 
         True if it is to be believed after all: there were so many in a row that the state must be wrong, and it agrees
-        with the one before, so that it is no lone spike.
+        to `spread` with the one before, so that it is no lone spike.
         """
         last = self._last_miss.get(sensor)
         self._last_miss[sensor] = miss
