@@ -506,7 +506,7 @@ class Episodes:
 
 
 def _hang_up(server: ControlServer) -> None:
-    """Take a socket away again at which nobody has been heard."""
+    """Close and remove a socket at which nobody has listened yet."""
     with server:
         pass
 

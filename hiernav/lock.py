@@ -28,7 +28,7 @@ _held: WeakValueDictionary[Path, _Held] = WeakValueDictionary()
 
 
 def try_lock(file: int) -> bool:
-    """Whether an open file is locked by this process now, until it is closed; so it is where there are no locks."""
+    """Lock an open file until this process closes it; False if another has it. True where there are no locks."""
     if fcntl is not None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

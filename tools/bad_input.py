@@ -11,7 +11,7 @@ BAD_INPUT = 2
 
 
 def exit_code(tool: str, main: Callable[[], int]) -> int:
-    """Of `main`, or of what was wrong with its input."""
+    """That of `main`, or of bad input, which is told in one line."""
     try:
         return main()
     except (ValueError, OSError) as error:

@@ -20,14 +20,14 @@ def epochs(samples: int) -> int:
 
 
 def updates(samples: int) -> int:
-    """Gradient updates in all of them."""
+    """Gradient updates in the passes over so many samples."""
     return epochs(samples) * -(-samples // BATCH)
 
 
 def configuration(
     samples: int, preset: str, seed: int, world: str, robot: str = "point", settings: Sequence[str] = ()
 ) -> TrainConfig:
-    """Of the training of an entry of Table II, its folders apart; `settings` are laid over all others."""
+    """What an entry of Table II is trained with, its folders apart; `settings` are laid over all others."""
     return load_config(
         None,
         [
@@ -50,5 +50,5 @@ def what_decides(config: TrainConfig) -> str:
 
 
 def digest(text: str) -> str:
-    """For names of folders: what differs lies apart."""
+    """A short hash for the names of folders: what differs lies apart."""
     return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -82,7 +82,7 @@ def cell_key(cell: Cell, places: Places) -> str:
 
 
 def training_hash(cell: Cell, places: Places) -> str | None:
-    """Of what the run folder that drives says of its trainings, for a cell that drives one; None where it is not here.
+    """Hash of what a run folder says of its trainings, for a cell that drives one; None where the folder is not here.
 
     Another training of the same configuration is another robot: no two end after the same time.
     """

@@ -18,7 +18,7 @@ PACKAGES = ("numpy", "onnxruntime", "mcap")
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """Of a run; the fields of a recording's metadata."""
+    """What the metadata of a recording say of its run."""
 
     robot: str
     robot_radius: float

@@ -54,9 +54,9 @@ class Account:
         self.episodes: deque[Episode] = deque(maxlen=kept)
         self.faults: deque[Fault] = deque(maxlen=KEPT)
         self.fault_count = 0
-        """Of all faults."""
+        """All there were, also those that are no longer named in `faults`."""
         self.ends: Counter[str] = Counter()
-        """Of all episodes, by `RunResult.reason`."""
+        """How many episodes ended, by `RunResult.reason`, also those that are no longer kept."""
         self.replans: Counter[str] = Counter()
         self.plans: Counter[str] = Counter()
         self.guard: Counter[str] = Counter()
@@ -114,7 +114,7 @@ class GoalWatch(Observer):
         self._truth: Truth | None = None
         """Of the newest tick, or of the one in which a goal ended that is not noted yet."""
         self._settled = False
-        """Whether it is the latter."""
+        """Whether `_truth` is of the tick in which a goal ended."""
         self._before: int | None = None
         """Collisions that there had been when the goal was set; None if that was in this tick."""
 

@@ -35,7 +35,7 @@ from hiernav.runtime.watchdogs import BlindWatch, BlockedWatch, OverrunWatch, Pl
 
 SECTIONS = ("read", "estimate", "plan", "infer", "guard", "send")
 FLUSH_SECONDS = 1.0
-"""What observers are given to bring their data to safety once the robot is braked [s]."""
+"""Time that observers are given to save their data once the robot is braked [s]."""
 MAX_SATURATED = 3
 """Recoveries from a saturated action on the way to one goal."""
 
@@ -63,7 +63,7 @@ class _Run:
     """One call of `run` or `serve`: its watches, and what the next tick must know of the last ones."""
 
     first_tick: int
-    """Of the loop, whose ticks are counted over all runs."""
+    """Ticks of the loop before this run: it counts them over all runs."""
     terms: TermHold
     blind: BlindWatch
     overruns: OverrunWatch
@@ -78,13 +78,13 @@ class _Run:
     saturated: int = 0
     """Recoveries from a saturated action on the way to the present goal."""
     frame: SensorFrame | None = None
-    """The newest."""
+    """The newest that was read."""
     occupancy: OccupancyMap | None = None
-    """The newest."""
+    """The newest that was driven on."""
     restarts: int | None = None
-    """Of the estimator, that are known of."""
+    """`Estimate.restarts` for which plans have been dropped; None before the first estimate."""
     unshown: _Seen | None = None
-    """The present tick, until it was shown."""
+    """The present tick, until observers were told of it."""
     told: tuple[str, str | None] = ("", None)
     """The failure that was logged last, and the fault that it led to."""
 
@@ -137,7 +137,7 @@ class Driver:
         self.interrupted = False
         """Whether SIGINT, SIGTERM or SIGHUP arrived in the last run, be it while the robot was stopping at its goal."""
         self.gone: str | None = None
-        """Why the last run ended without anybody's wish: the robot cannot be read any more (`RobotGone`)."""
+        """Why the last run ended though nobody asked for it: the robot cannot be read any more (`RobotGone`)."""
         self.last_trip: Trip | None = None
         """The goal that ended last, whether the robot has been seen to stand since or not."""
         self.last_result: RunResult | None = None
@@ -232,7 +232,7 @@ class Driver:
 
     @property
     def estimate(self) -> Estimate | None:
-        """The newest."""
+        """The newest; None until position and heading are known."""
         return self._estimate
 
     def _begin(self) -> None:

@@ -28,7 +28,7 @@ JUMP_AFTER, RESTART_AFTER = 2, 10
 
 
 class _Accuracy(NamedTuple):
-    """Of a mean angular velocity, and what it makes of the accelerometer."""
+    """How exact a mean angular velocity is, and how far the accelerometer is trusted beside it."""
 
     walk: float
     """Error of the rate [rad/s]."""
@@ -94,7 +94,7 @@ class Estimator:
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
         self._unsure: dict[str, _First] = {}
-        """By sensor, the first reading of those of which no other agrees with it yet."""
+        """By sensor, the first reading, as long as no other has agreed with it."""
         self._rejected: Counter[str] = Counter()
         self._rejected_at: dict[str, float] = {}
         self._last_miss: dict[str, tuple[float, ...]] = {}

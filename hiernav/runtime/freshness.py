@@ -13,14 +13,14 @@ from hiernav.runtime.terms import is_sound
 Reading = tuple[float, ...]
 
 STIR, LEAP = 0.5, 8.0
-"""Changes of a reading, in standard deviations: that noise causes within moments, and that only motion causes."""
+"""Changes of a reading, in standard deviations: noise causes the first within moments, only motion the second."""
 LEARN = 10
 """Readings without repetition after which a sensor is known to be noisy."""
 REPEATS = 3
 """Repetitions in a row, while nothing else changes either, that a noisy sensor never shows."""
 TRAVEL, SPARE = 0.2, 3.0
-"""A way that changes what lidar and joints read [m], or where they are coarse, as a multiple of the longest on which a
-reading has lasted. The former is farther than dead reckoning runs on while a robot hits a wall."""
+"""How far a robot is driven before lidar and joints must read something else [m], and, where they are coarse, how many
+times as far as any reading has lasted. The first is farther than dead reckoning runs on while a robot hits a wall."""
 
 
 @dataclass
@@ -44,9 +44,9 @@ class SensorWatch:
 
     Noise makes a sensor differ from one reading to the next. One that has done so, then repeats itself to the bit
     under fresh stamps while others go on changing, is frozen; so are all of them if all repeat themselves at once, and
-    none ever did before. A reading of nothing but zeros is what wheel encoders
-    say at rest; it is frozen only once another sensor has changed as only motion changes it. A sensor that repeats
-    itself in health, being coarse or without noise, is not judged: what it says wrong is for the gates to find.
+    none ever did before. A reading of nothing but zeros is what wheel encoders say at rest; it is frozen only once
+    another sensor has changed as only motion changes it. A sensor that repeats itself in health, being coarse or
+    without noise, is not judged: what it says wrong is for the gates to find.
     """
 
     def __init__(self, sigma: Mapping[str, float]) -> None:

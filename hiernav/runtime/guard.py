@@ -69,7 +69,7 @@ class Guarded:
 
 
 class Guard:
-    """Lets through what is finite, within limits and commanded by a robot that stands."""
+    """Makes actions safe: clips, slows and slews them, and brakes where one is not finite or the robot has tilted."""
 
     def __init__(self, action_dim: int, config: GuardConfig | None = None) -> None:
         """

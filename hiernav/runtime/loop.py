@@ -16,7 +16,7 @@ from hiernav.runtime.timing import Histogram
 
 BRAKE_ATTEMPTS = 3
 SPOILT = 10
-"""Deadlines in a row that preparing for them has made late, after which it is dropped."""
+"""Deadlines in a row that were missed for preparing for them, after which nothing is prepared any more."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks for an end. A SIGHUP that is ignored, as under nohup, asks for none."""
 
@@ -59,8 +59,8 @@ class FixedRateLoop:
             tick: called with the time [s]; returns True when the loop is done.
             brake: stops the robot.
             handle_signals: turn `STOP_SIGNALS` into an interruption while the loop runs in the main thread.
-            prepare: called just early enough before a deadline to be done by then, where there is time; with False, and
-                then, if there is time for that as well, with True.
+            prepare: called before a deadline, where there is time for it, as late as it can be and be done by then:
+                with False, and once more with True if there is time for that as well.
             lead: time before the deadline at which it is begun at most [s].
 
         Raises:

@@ -31,7 +31,7 @@ class MessageError(ValueError):
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Arrays are lists, vectors without NaN or infinity plain numbers; units are those of the runtime's classes."""
+    """Arrays are flat lists, numbers that are not finite are texts; units are those of the runtime's classes."""
 
 
 class Sensors(Message, frozen=True):

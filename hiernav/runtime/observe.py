@@ -76,7 +76,7 @@ class Event:
     time: float
     """On the loop's clock [s]."""
     kind: str
-    """mode, goal, plan, planner, stop or end."""
+    """mode, goal, plan, end, stop or fault."""
     text: str
     """For people."""
     values: Mapping[str, float | int | str | bool | None] = field(default_factory=dict)

@@ -13,7 +13,7 @@ _TERMS = (*VECTOR_SENSORS, "lidar")
 READINGS = (*_TERMS, "position_fix", "rotation")
 """Fields of a frame that are an array, or None where nothing was read."""
 SIZES = {**dict.fromkeys(VECTOR_SENSORS, 3), "position_fix": 2, "rotation": 4}
-"""Number of values of those that are the same for every robot."""
+"""Number of values of the sensors that are alike on every robot."""
 ABSURD = 1e6
 """No sensor reads more than this in its SI unit; such values, which could overflow the arithmetic, count as missing."""
 

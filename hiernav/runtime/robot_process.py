@@ -37,7 +37,7 @@ END = b"e"
 STATUS = 64
 """Bytes at the front of the memory: how often the watchdog braked, and when last; which frame the loop has taken."""
 TAKEN = 2
-"""Place of the latter among them; the control process writes it."""
+"""Index of the last of these numbers, which the control process writes."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0

@@ -25,7 +25,7 @@ class Mode(Enum):
     FAULT = "fault"
     """Something must be looked at. Latches until it is acknowledged."""
     ESTOP = "estop"
-    """Somebody pressed stop. Latches until it is released."""
+    """Somebody pressed stop. Latches until it is acknowledged."""
 
 
 LATCHED = frozenset({Mode.FAULT, Mode.ESTOP})
@@ -45,7 +45,7 @@ TRANSITIONS: dict[Mode, frozenset[Mode]] = {
 
 
 REASONS = 5
-"""Of one latched mode."""
+"""That a latched mode tells at most; further ones are dropped."""
 
 
 class InvalidTransition(RuntimeError):

@@ -9,7 +9,7 @@ from hiernav.runtime.trip import Trip
 
 @dataclass
 class Ticket:
-    """Of one command. It waits until it is taken, at the beginning of a tick, or dropped."""
+    """What became of one command: it waits until it is taken, at the beginning of a tick, or dropped."""
 
     taken: int | None = None
     """The tick (`FixedRateLoop.ticks`) that took it; what it does is done when that tick ends."""
@@ -20,7 +20,7 @@ class Ticket:
     dropped: bool = False
     """Whether it will never be taken."""
     trip: Trip | None = None
-    """Of a goal that was taken."""
+    """The drive to a goal that was taken."""
 
     def drop(self, why: str) -> None:
         self.why, self.dropped = why, True

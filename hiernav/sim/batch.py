@@ -26,7 +26,7 @@ class BatchSim:
     Arrays published after each `reset` and `step`. They are new each time and never written again:
         pose (N, 3): x, y [m] and yaw [rad] in [-pi, pi), world frame.
         velocity (N, 2): of the body origin, world frame [m/s].
-        upright (N,): z component of the body's z axis, 1 when it stands.
+        upright (N,): z component of the body's z axis, 1 when it is upright.
         collided (N,) bool: the robot touched an obstacle in any substep of the last control step.
         sensors: name -> (N, d). accelerometer, velocimeter, gyro and magnetometer (3 each, body frame) and the robot's
             `own_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that

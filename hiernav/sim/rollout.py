@@ -36,7 +36,7 @@ class Episode:
     replans: dict[str, int]
     refused: int
     recoveries: int
-    """Times the robot stood still and backed out."""
+    """Times the robot stood still and was given a way out."""
 
     @property
     def steps_counted(self) -> int:

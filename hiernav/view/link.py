@@ -30,7 +30,7 @@ SHOW_HZ = 20.0
 COMMANDS_PER_TICK = 4
 """Commands that are obeyed in a tick, emergency stops aside; more are refused."""
 PAGE_BUFFER, HEARD_PER_TICK = 65536, 256
-"""Of the page's end of the socket [bytes], and messages that are taken from it in a tick: more than it holds."""
+"""What the page's end of the socket holds [bytes], and messages that are read in a tick at most: more than that."""
 LARGEST_MAP = 1_000_000
 """Pixels of a map that is shown as it is; a larger one is shown coarser."""
 START_SECONDS = 30.0
