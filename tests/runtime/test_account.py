@@ -108,8 +108,10 @@ def driven(folder: Path) -> list[str]:
 
 
 def test_a_signal_between_two_worlds_costs_nothing_of_what_was_driven(run, tmp_path, monkeypatch):
-    tell = script.Episodes._tell
-    monkeypatch.setattr(script.Episodes, "_tell", lambda *given: signal.raise_signal(signal.SIGTERM) or tell(*given))
+    tell = script.Episodes._say_ended
+    monkeypatch.setattr(
+        script.Episodes, "_say_ended", lambda *given: signal.raise_signal(signal.SIGTERM) or tell(*given)
+    )
     assert run(*SHORT, "--episodes", "3") == 0
     assert driven(tmp_path) == ["timeout"]
 
