@@ -23,7 +23,7 @@ from hiernav.nav.bundle import MANIFEST, PLANNER, SKILL, file_sha256, load_bundl
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.nav.option import Planner, Skill, TerminationReason
 from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
-from hiernav.runtime.policy import load_policies
+from hiernav.runtime.policy import load_networks
 from hiernav.sim.factory import default_planner, expert_planner, make_task, skill_layout
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot
@@ -268,7 +268,7 @@ def _from_bundle(path: Path) -> Policies:
     bundle.require_period(robot.control_period)
     bundle.require_actions(robot.action_dim)
     bundle.require_resolution(RESOLUTION)
-    loaded = load_policies(bundle)
+    loaded = load_networks(bundle)
     manifest, terms = bundle.manifest, bundle.layout.names
     skill = "baseline" if "goal" in terms else "default"
     presets = load_config(

@@ -20,7 +20,7 @@ from hiernav.nav.bundle import HASHED_FILES, MANIFEST, BundleError, file_sha256,
 from hiernav.nav.option import Planner, PlanQuery  # noqa: E402
 from hiernav.planner.train import load_network  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
-from hiernav.runtime.policy import check_golden, load_policies, make_agent  # noqa: E402
+from hiernav.runtime.policy import check_golden, load_networks, make_agent  # noqa: E402
 from hiernav.sim.factory import make_task  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
 from hiernav.sim.robots import get_robot  # noqa: E402
@@ -190,7 +190,7 @@ def test_a_network_that_was_altered_with_its_hash_fails_on_the_golden_inputs(bun
     files = json.loads((bundle / MANIFEST).read_text())["files"]
     edit_manifest(bundle, files=files | {"skill.onnx": file_sha256(bundle / "skill.onnx")})
     with pytest.raises(BundleError, match="golden action: off by"):
-        load_policies(load_bundle(bundle))
+        load_networks(load_bundle(bundle))
 
 
 def test_a_bundle_for_another_robot_is_refused_by_name(bundle):

@@ -16,7 +16,7 @@ from turns import Skipped, Turns
 from hiernav.config import load_config
 from hiernav.nav.bundle import load_bundle
 from hiernav.nav.option import Planner
-from hiernav.runtime.policy import load_policies, make_planner
+from hiernav.runtime.policy import load_networks, make_planner
 from hiernav.sim.factory import make_task
 from hiernav.sim.robots import ROBOTS, get_robot
 from hiernav.sim.task import NavigationTask
@@ -41,7 +41,7 @@ def _bench_robot(robot: str, arguments: argparse.Namespace) -> dict[str, Any]:
         contenders[f"bare mj_step, {threads}"] = Bare(task, threads).run
     # a network of the same size stands in where a robot's own does not ship
     bundle = load_bundle(BUNDLES / (robot if (BUNDLES / robot).exists() else "car"))
-    planner = make_planner(bundle, load_policies(bundle).planner, get_robot(robot).radius)
+    planner = make_planner(bundle, load_networks(bundle).planner, get_robot(robot).radius)
     contenders["learned planner, 1"] = partial(timed, Driven(_task(robot, 1, planner)).step)
     peer = _peer(robot, arguments.safety_python)
     if peer is not None:

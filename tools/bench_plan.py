@@ -27,12 +27,12 @@ def bench_plan(arguments: argparse.Namespace) -> dict[str, Any]:
     from hiernav.nav.option import PlanQuery
     from hiernav.nav.search import PathField
     from hiernav.planner.dataset import LabelSettings, label_world
-    from hiernav.runtime.policy import load_policies, make_planner
+    from hiernav.runtime.policy import load_networks, make_planner
     from hiernav.sim.layout import parse_world
     from hiernav.sim.worlds import sample_layout
 
     bundle = load_bundle(arguments.bundle)
-    network, channels = load_policies(bundle).planner, bundle.manifest.goselo.channels
+    network, channels = load_networks(bundle).planner, bundle.manifest.goselo.channels
     radius, margin = bundle.manifest.plan.planning_radius_m, bundle.manifest.plan.soft_margin_m
     verified = make_planner(bundle, network, radius)
     layouts = [sample_layout(parse_world(WORLD), seed, radius) for seed in range(32)]

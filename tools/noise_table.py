@@ -47,7 +47,7 @@ from hiernav.runtime.estimator import Estimator  # noqa: E402
 from hiernav.runtime.guard import Guard  # noqa: E402
 from hiernav.runtime.noise import EXACT  # noqa: E402
 from hiernav.runtime.pilot import Pilot  # noqa: E402
-from hiernav.runtime.policy import load_policies, make_agent, make_planner  # noqa: E402
+from hiernav.runtime.policy import load_networks, make_agent, make_planner  # noqa: E402
 from hiernav.runtime.robot import SensorFrame  # noqa: E402
 from hiernav.runtime.settings import Settings, load_settings  # noqa: E402
 from hiernav.runtime.sim_robot import SimRobot  # noqa: E402
@@ -156,7 +156,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
     clock = FakeClock()
     link = None
     if case != NOISE_FREE:
-        network = load_policies(bundle).planner
+        network = load_networks(bundle).planner
         link = DelayedPlanner(make_planner(bundle, network, spec.radius), 1e-3 * case.planner_ms)
     robot = SimRobot(spec, layouts[0], noise, seeds[0])
     driver = Driver(

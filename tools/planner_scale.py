@@ -29,7 +29,7 @@ from hiernav.nav.bundle import load_bundle
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.option import Planner, PlanQuery
 from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
-from hiernav.runtime.policy import load_policies
+from hiernav.runtime.policy import load_networks
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.worlds import sample_layout
 
@@ -49,7 +49,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
     bundle = load_bundle(arguments.bundle)
-    network, plan = load_policies(bundle).planner, bundle.manifest.plan
+    network, plan = load_networks(bundle).planner, bundle.manifest.plan
     radius = plan.planning_radius_m
 
     def planner_of(name: str) -> Planner:

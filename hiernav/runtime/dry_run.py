@@ -17,7 +17,7 @@ from hiernav.nav.bundle import Bundle
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.filter_check import TOLERANCE, filter_deviation
 from hiernav.runtime.guard import Guard
-from hiernav.runtime.policy import check_golden, load_policies, require_fit
+from hiernav.runtime.policy import check_golden, load_networks, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import READINGS, SIZES, SensorFrame
@@ -68,9 +68,9 @@ def _attempt(check: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def _check_bundle(bundle: Bundle) -> dict[str, Any]:
-    policies = load_policies(bundle)
+    networks = load_networks(bundle)
     manifest = bundle.manifest
-    worst = max(check_golden(bundle, policies).values())
+    worst = max(check_golden(bundle, networks).values())
     return {
         "robot": manifest.robot,
         "control period": f"{1e3 * manifest.control_period_s:g} ms",

@@ -99,14 +99,14 @@ class OnnxPlannerNetwork:
 
 
 @dataclass(frozen=True)
-class Policies:
+class Networks:
     """Both networks of a bundle."""
 
     skill: OnnxSkill
     planner: OnnxPlannerNetwork
 
 
-def load_policies(bundle: Bundle) -> Policies:
+def load_networks(bundle: Bundle) -> Networks:
     """Load both networks, check them against the manifest and on the golden inputs, and the manifest against what is
     done here with both.
 
@@ -114,22 +114,22 @@ def load_policies(bundle: Bundle) -> Policies:
         BundleError: a network does not load, has other inputs or outputs than the manifest says, or gives other values
             than it did when it was exported; images or plans are not made here as the manifest says.
     """
-    policies = Policies(OnnxSkill(bundle.skill), OnnxPlannerNetwork(bundle.planner))
+    networks = Networks(OnnxSkill(bundle.skill), OnnxPlannerNetwork(bundle.planner))
     manifest = bundle.manifest
-    _require_tensors(policies.skill._session, manifest.skill.inputs, manifest.skill.outputs, SKILL)
-    _require_tensors(policies.planner._session, manifest.planner.inputs, manifest.planner.outputs, PLANNER)
+    _require_tensors(networks.skill._session, manifest.skill.inputs, manifest.skill.outputs, SKILL)
+    _require_tensors(networks.planner._session, manifest.planner.inputs, manifest.planner.outputs, PLANNER)
     for what, ours, theirs in (
-        ("observation size", policies.skill.observation_size, bundle.layout.size),
-        ("planner channels", policies.planner.channels, manifest.planner.channels),
-        ("plan.waypoints", policies.planner.waypoints, manifest.plan.waypoints),
-        ("number of goselo.channels", policies.planner.channels, len(manifest.goselo.channels)),
+        ("observation size", networks.skill.observation_size, bundle.layout.size),
+        ("planner channels", networks.planner.channels, manifest.planner.channels),
+        ("plan.waypoints", networks.planner.waypoints, manifest.plan.waypoints),
+        ("number of goselo.channels", networks.planner.channels, len(manifest.goselo.channels)),
     ):
         if ours != theirs:
             raise BundleError(f"{what}: {ours} in the network, {theirs} in the manifest")
     _require_images(manifest.goselo)
     _require_waypoints(bundle)
-    check_golden(bundle, policies)
-    return policies
+    check_golden(bundle, networks)
+    return networks
 
 
 def _require_images(spec: GoseloSpec) -> None:
@@ -219,11 +219,11 @@ def make_agent(
         rows: robots that are driven at once.
 
     Raises:
-        BundleError: as `load_policies`.
+        BundleError: as `load_networks`.
     """
-    policies, plan, replan = load_policies(bundle), bundle.manifest.plan, bundle.manifest.replan
+    networks, plan, replan = load_networks(bundle), bundle.manifest.plan, bundle.manifest.replan
     option = WaypointOption(
-        planner or make_planner(bundle, policies.planner, robot_radius, goal_radius),
+        planner or make_planner(bundle, networks.planner, robot_radius, goal_radius),
         num_rows=rows,
         rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
         num_waypoints=plan.waypoints,
@@ -232,10 +232,10 @@ def make_agent(
         refresh=refresh_steps(bundle.manifest.control_period_s),
         predict=predict,
     )
-    return HierarchicalAgent(option, policies.skill, bundle.layout, bundle.manifest.control_period_s)
+    return HierarchicalAgent(option, networks.skill, bundle.layout, bundle.manifest.control_period_s)
 
 
-def check_golden(bundle: Bundle, policies: Policies | None = None) -> dict[str, float]:
+def check_golden(bundle: Bundle, networks: Networks | None = None) -> dict[str, float]:
     """Run the golden inputs.
 
     Returns:
@@ -244,12 +244,12 @@ def check_golden(bundle: Bundle, policies: Policies | None = None) -> dict[str, 
     Raises:
         BundleError: an output deviates by more than 1e-5 or is not finite; names it.
     """
-    policies = policies or Policies(OnnxSkill(bundle.skill), OnnxPlannerNetwork(bundle.planner))
+    networks = networks or Networks(OnnxSkill(bundle.skill), OnnxPlannerNetwork(bundle.planner))
     golden = bundle.golden
     try:
-        waypoints, scores = policies.planner(golden["image"], golden["distance"])
+        waypoints, scores = networks.planner(golden["image"], golden["distance"])
         # Row by row: that is the way the robot calls it.
-        action = np.concatenate([policies.skill(row[None]) for row in golden["observation"]])
+        action = np.concatenate([networks.skill(row[None]) for row in golden["observation"]])
     except Exception as error:  # ONNX Runtime raises classes of its own, without a common base but this
         raise BundleError(f"golden inputs do not fit the networks: {error}") from None
     deviations = {}

@@ -22,7 +22,7 @@ from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.log_reader import LogError, RunLog
 from hiernav.runtime.observe import Event, TickRecord
-from hiernav.runtime.policy import load_policies, make_agent, make_planner
+from hiernav.runtime.policy import load_networks, make_agent, make_planner
 from hiernav.runtime.terms import TermHold
 
 ASKED = 256
@@ -88,7 +88,7 @@ class Replay:
         if about.robot != bundle.manifest.robot:
             raise LogError(f"{log.path}: a drive of {about.robot!r}, and a bundle for {bundle.manifest.robot!r}")
         self.same_policies = about.hashes == bundle.manifest.files
-        network = load_policies(bundle).planner
+        network = load_networks(bundle).planner
         self._planner = make_planner(bundle, network, about.robot_radius, about.goal_radius)
         self._asked = _Asked() if about.planner_process else None
         self._agent = make_agent(bundle, about.robot_radius, about.goal_radius, self._asked, about.predict)

@@ -22,7 +22,7 @@ from hiernav.nav.planners import (
     verified_planner,
 )
 from hiernav.nav.search import CELL, GOAL_REACH, REFUSALS, PathField, goal_reach_for, keeps_room
-from hiernav.runtime.policy import load_policies
+from hiernav.runtime.policy import load_networks
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.walk import walk
 from hiernav.sim.worlds import sample_layout
@@ -42,7 +42,7 @@ def verified(radius: float, proposer=None) -> VerifiedPlanner:
 @pytest.fixture(scope="module")
 def network() -> GoseloPlanner:
     bundle = load_bundle(BUNDLE)
-    return GoseloPlanner(load_policies(bundle).planner, bundle.manifest.goselo.channels, 0.1, 0.15)
+    return GoseloPlanner(load_networks(bundle).planner, bundle.manifest.goselo.channels, 0.1, 0.15)
 
 
 # free plans

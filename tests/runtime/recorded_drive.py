@@ -23,7 +23,7 @@ from hiernav.runtime.guard import GuardConfig
 from hiernav.runtime.noise import SensorNoise
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.runtime.pilot import Pilot
-from hiernav.runtime.policy import load_policies, make_agent, make_planner
+from hiernav.runtime.policy import load_networks, make_agent, make_planner
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.runtime.trip import RunResult
@@ -128,7 +128,7 @@ def _driver(
     robot = SimRobot(spec, layout, noise, layout.seed)
     link = None
     if delay is not None:
-        network = load_policies(bundle).planner
+        network = load_networks(bundle).planner
         link = DelayedPlanner(make_planner(bundle, network, spec.radius, GOAL_RADIUS), delay)
     try:
         yield Driver(

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 from small_bundle import CHANNELS, LAYOUT, model_bytes, planner_bytes, skill_bytes, value, write_bundle
 
 from hiernav.nav import bundle as b
-from hiernav.runtime.policy import OnnxPlannerNetwork, OnnxSkill, check_golden, load_policies
+from hiernav.runtime.policy import OnnxPlannerNetwork, OnnxSkill, check_golden, load_networks
 
 OBSERVATIONS = np.random.default_rng(0).standard_normal((7, LAYOUT.size)).astype(np.float32)
 
@@ -76,8 +76,8 @@ def test_what_onnx_runtime_cannot_load_is_refused_by_file():
 def test_a_whole_bundle_loads_and_keeps_its_golden_promises(tmp_path: Path):
     write_bundle(tmp_path)
     bundle = b.load_bundle(tmp_path)
-    policies = load_policies(bundle)
-    deviations = check_golden(bundle, policies)
+    networks = load_networks(bundle)
+    deviations = check_golden(bundle, networks)
     assert set(deviations) == {"action", "waypoints", "scores"}
     assert max(deviations.values()) <= 1e-5
 
@@ -96,16 +96,16 @@ def test_a_network_that_answers_differently_than_at_export_is_refused(tmp_path, 
     value_ = b.load_bundle(tmp_path).golden[name].copy()
     value_.flat[-1] += error
     with pytest.raises(b.BundleError, match=f"golden {name}: off by"):
-        load_policies(rewrite_golden(tmp_path, **{name: value_}))
+        load_networks(rewrite_golden(tmp_path, **{name: value_}))
 
 
 def test_golden_inputs_of_another_shape_are_refused(tmp_path):
     write_bundle(tmp_path)
     with pytest.raises(b.BundleError, match="golden inputs do not fit"):
-        load_policies(rewrite_golden(tmp_path, observation=np.zeros((4, 9), np.float32)))
+        load_networks(rewrite_golden(tmp_path, observation=np.zeros((4, 9), np.float32)))
     write_bundle(tmp_path)
     with pytest.raises(b.BundleError, match="golden scores: shape"):
-        load_policies(rewrite_golden(tmp_path, scores=np.zeros((3, 5), np.float32)))
+        load_networks(rewrite_golden(tmp_path, scores=np.zeros((3, 5), np.float32)))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_a_manifest_that_describes_another_network_is_refused(tmp_path, part, ke
     fields[part][key][0][field] = wrong
     path.write_text(json.dumps(fields))
     with pytest.raises(b.BundleError, match=message):
-        load_policies(b.load_bundle(tmp_path))
+        load_networks(b.load_bundle(tmp_path))
 
 
 def test_an_observation_list_longer_than_the_networks_input_is_refused(tmp_path):
@@ -133,7 +133,7 @@ def test_an_observation_list_longer_than_the_networks_input_is_refused(tmp_path)
     )
     write_bundle(tmp_path, observation=(*layout, longer))
     with pytest.raises(b.BundleError, match="observation size: 5 in the network, 6 in the manifest"):
-        load_policies(b.load_bundle(tmp_path))
+        load_networks(b.load_bundle(tmp_path))
 
 
 def test_a_planner_that_answers_in_another_type_is_refused():
@@ -168,7 +168,7 @@ def test_a_manifest_that_the_runtime_would_not_keep_to_is_refused(tmp_path, part
     fields[part][field] = wrong
     path.write_text(json.dumps(fields))
     with pytest.raises(b.BundleError, match=message):
-        load_policies(b.load_bundle(tmp_path))
+        load_networks(b.load_bundle(tmp_path))
 
 
 def test_a_skill_that_observes_another_number_of_waypoints_than_a_plan_has_is_refused(tmp_path):
@@ -176,4 +176,4 @@ def test_a_skill_that_observes_another_number_of_waypoints_than_a_plan_has_is_re
     layout = tuple(b.ObservationField(name=name, size=size, unit="m", scale=1.0) for name, size in fields)
     write_bundle(tmp_path, observation=layout)
     with pytest.raises(b.BundleError, match="plan.waypoints: 10 in a plan, the skill observes 2"):
-        load_policies(b.load_bundle(tmp_path))
+        load_networks(b.load_bundle(tmp_path))
