@@ -246,7 +246,7 @@ class Driver:
         self._run = self._new_run()
         if self._run.must_stand:
             self._run.standing.begin(now)
-        self.estimator.skill_terms, self.estimator.driven = self.pilot.sizes, False
+        self.estimator.skill_sensors, self.estimator.driven = self.pilot.sensors, False
         self.estimator.reset()
         self.last_result = None
         _warm_up(self.estimator.config)
@@ -255,7 +255,7 @@ class Driver:
         config, trust = self.config, self.estimator.config
         return _Run(
             first_tick=self.loop.ticks,
-            terms=TermHold(self.pilot.sizes),
+            terms=TermHold(self.pilot.sensors),
             blind=BlindWatch(trust.hold_after, trust.lost_after, config.first_estimate),
             overruns=OverrunWatch(),
             plans=PlanWatch(config.plan_slow, config.plan_hold),

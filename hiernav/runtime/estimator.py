@@ -65,7 +65,7 @@ class Estimator:
         self._limits = [(name, config.hold_after, config.lost_after) for name in VECTOR_SENSORS]
         self._limits.append(("position_fix", config.fix_hold_after, config.fix_lost_after))
         self._starts = 0
-        self.skill_terms: Mapping[str, int] | None = None
+        self.skill_sensors: Mapping[str, int] | None = None
         """How many values each sensor gives that the skill observes; None: whatever comes is watched. From the next
         reset on."""
         self.driven = False
@@ -102,7 +102,7 @@ class Estimator:
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
         self._watch = SensorWatch(sigmas | {"position_fix": config.fix_sigma})
-        self._terms = TermWatch(self.skill_terms)
+        self._terms = TermWatch(self.skill_sensors)
         self._travelled = (0.0, 0.0)
         """Where it was driven to, by dead reckoning [m]."""
         self._flaws: dict[str, str] = {}

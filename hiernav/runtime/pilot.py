@@ -133,7 +133,7 @@ class Pilot:
         self.reset()
 
     @property
-    def sizes(self) -> dict[str, int]:
+    def sensors(self) -> dict[str, int]:
         """How many values each sensor gives that the skill observes, by name."""
         return self.agent.layout.sensors
 

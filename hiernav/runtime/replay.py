@@ -139,10 +139,10 @@ class Replay:
 
     def _begin(self) -> None:
         """The loop was started: the estimator knows nothing."""
-        sizes = self._agent.layout.sensors
-        self._estimator.skill_terms = sizes
+        sensors = self._agent.layout.sensors
+        self._estimator.skill_sensors = sensors
         self._estimator.reset()
-        self._terms = TermHold(sizes)
+        self._terms = TermHold(sensors)
 
     def _happened(self, event: Event) -> None:
         if event.kind == "goal" and "x" in event.values:

@@ -93,7 +93,7 @@ class Scripted:
     restarts: int = 0
     plan_counts: Mapping[str, int] = field(default_factory=dict)
     recoveries: int = 0
-    sizes: Mapping[str, int] | None = None
+    sensors: Mapping[str, int] | None = None
     control_period: float | None = None
     """None: that of the robot it is given to (`driver_of`)."""
 
