@@ -98,22 +98,7 @@ def run_episodes(
         if not len(ended):
             continue
         for row in ended.tolist():
-            layout = task.layouts[row]
-            counts = task.option.counts[row]
-            episode = Episode(
-                seed=layout.seed,
-                reached=bool(step.reached[row]),
-                reason=_reason(step, row, fallen=bool(task.sim.upright[row] < 0.0)),
-                steps=int(task.steps[row]),
-                cap=layout.spec.max_steps,
-                collisions=int(collisions[row]),
-                return_=float(earned[row]),
-                path_length=float(driven[row]),
-                shortest_length=shortest_length(layout, task.robot.radius),
-                replans={r.name.lower(): int(counts[r]) for r in TerminationReason if r != TerminationReason.NONE},
-                refused=int(task.option.refused[row]),
-                recoveries=0 if task.recovery is None else int(task.recovery.counts[row]),
-            )
+            episode = _ended(task, step, row, int(collisions[row]), float(earned[row]), float(driven[row]))
             results[current[row]] = episode
             if on_episode is not None:
                 on_episode(int(current[row]), episode)
@@ -126,6 +111,27 @@ def run_episodes(
         for values in (driven, earned, collisions):
             values[ended] = 0
     return [episode for episode in results if episode is not None]
+
+
+def _ended(
+    task: NavigationTask, step: TaskStep, row: int, collisions: int, return_: float, path_length: float
+) -> Episode:
+    """The episode of a row that ended with this step."""
+    layout, counts = task.layouts[row], task.option.counts[row]
+    return Episode(
+        seed=layout.seed,
+        reached=bool(step.reached[row]),
+        reason=_reason(step, row, fallen=bool(task.sim.upright[row] < 0.0)),
+        steps=int(task.steps[row]),
+        cap=layout.spec.max_steps,
+        collisions=collisions,
+        return_=return_,
+        path_length=path_length,
+        shortest_length=shortest_length(layout, task.robot.radius),
+        replans={r.name.lower(): int(counts[r]) for r in TerminationReason if r != TerminationReason.NONE},
+        refused=int(task.option.refused[row]),
+        recoveries=0 if task.recovery is None else int(task.recovery.counts[row]),
+    )
 
 
 def shortest_length(layout: Layout, radius: float) -> float:
