@@ -49,9 +49,8 @@ def report(
     return found
 
 
-def print_report(found: Mapping[str, Any], console: Console | None = None) -> None:
+def print_report(found: Mapping[str, Any], console: Console) -> None:
     """Show a report made by `report`."""
-    console = console or Console()
     for part, entries in found.items():
         table = Table(title=part, title_justify="left", show_header=False)
         for key, value in entries.items():

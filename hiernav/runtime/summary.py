@@ -47,9 +47,8 @@ def summarise(account: Account, timer: TickTimer, loop: FixedRateLoop, realtime:
     }
 
 
-def print_summary(summary: Mapping[str, Any], console: Console | None = None) -> None:
+def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     """Show a summary made by `summarise`."""
-    console = console or Console()
     console.print(_episode_table(summary["episodes"], summary["ends"]))
     console.print(_timing_table(summary["timing"]))
     for title in ("ends", "replans", "plans", "guard"):

@@ -84,12 +84,11 @@ class TickTimer:
         self._recent.append(self._begun)
         self.last = {}
 
-    def mark(self, section: str) -> float:
-        """End of `section`, which began at the last mark; returns its duration [s]."""
+    def mark(self, section: str) -> None:
+        """End of `section`, which began at the last mark."""
         now = self._stopwatch()
         elapsed, self._last = now - self._last, now
         self.record(section, elapsed)
-        return elapsed
 
     def mark_split(self, section: str, other: str, other_seconds: float) -> None:
         """Like `mark`, where `other_seconds` [s] of the time since the last mark belong to the section `other`."""

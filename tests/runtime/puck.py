@@ -92,7 +92,6 @@ class Scripted:
     late: int = 0
     restarts: int = 0
     plan_counts: Mapping[str, int] = field(default_factory=dict)
-    recoveries: int = 0
     sensors: Mapping[str, int] | None = None
     control_period: float | None = None
     """None: that of the robot it is given to (`driver_of`)."""
