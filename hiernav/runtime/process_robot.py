@@ -19,7 +19,7 @@ from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import END, STATUS, TAKEN
+from hiernav.runtime.robot_process import END, STATUS, TAKEN, TRIPS
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command
 
 
@@ -58,7 +58,7 @@ class ProcessRobot:
         size = STATUS + 2 * Mailbox.size(CAPACITY)
         self._descriptor = shared_memory(size)
         memory = self._memory = mapped(self._descriptor)
-        self._status = np.frombuffer(memory, np.float64, 4)
+        self._status = np.frombuffer(memory, np.float64, 2)
         self._commands = Mailbox(memory, STATUS, CAPACITY)
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._calls, theirs = socket.socketpair()
@@ -93,12 +93,7 @@ class ProcessRobot:
     @property
     def watchdog_trips(self) -> int:
         """How often the adapter braked because no command came."""
-        return int(self._status[0])
-
-    @property
-    def last_trip(self) -> float:
-        """When it last did, on the monotonic clock [s]."""
-        return float(self._status[1])
+        return int(self._status[TRIPS])
 
     def read(self) -> SensorFrame:
         """The newest frame; the first one is waited for.

@@ -35,9 +35,10 @@ from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 END = b"e"
 """News that this process is not needed any more, and that the robot stands."""
 STATUS = 64
-"""Bytes at the front of the memory: how often the watchdog braked, and when last; which frame the loop has taken."""
-TAKEN = 2
-"""Index of the last of these numbers, which the control process writes."""
+"""Bytes at the front of the memory, of which `TRIPS` and `TAKEN` are in use."""
+TRIPS, TAKEN = 0, 1
+"""Places in there of how often the watchdog braked, and of the number of the newest frame that the loop has taken. The
+control process writes the latter."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0
@@ -104,7 +105,7 @@ class Adapter:
         self.watchdog = CommandWatchdog(self._period)
         self._news, self._calls = news, calls
         memory = self._memory = mapped(descriptor)
-        self._status = np.frombuffer(memory, np.float64, 4)
+        self._status = np.frombuffer(memory, np.float64, 2)
         self._commands = Mailbox(memory, STATUS, CAPACITY)
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._truth = getattr(robot, "truth", None)
@@ -190,8 +191,8 @@ class Adapter:
         elif self.watchdog.expired(now):
             # once, then at the control rate: a bus may need the brake repeated, but not hundreds of times a second
             trips = self.watchdog.trips
-            if trips > self._status[0]:
-                self._status[0], self._status[1] = trips, now
+            if trips > self._status[TRIPS]:
+                self._status[TRIPS] = trips
                 self.robot.brake()
                 self._braked = now
             elif trips and now - self._braked >= self._period:
