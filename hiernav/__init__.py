@@ -14,20 +14,15 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
+    from hiernav.nav.agent import HierarchicalAgent
     from hiernav.nav.bundle import Bundle, BundleError, load_bundle
     from hiernav.nav.mapfile import load_map
     from hiernav.nav.observation import ObservationLayout
     from hiernav.nav.occupancy import OccupancyMap, VisitMap
-    from hiernav.nav.option import (
-        HierarchicalAgent,
-        Planner,
-        PlanQuery,
-        ReplanRule,
-        TerminationReason,
-        WaypointOption,
-    )
+    from hiernav.nav.option import Planner, PlanQuery, WaypointOption
     from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner
     from hiernav.nav.search import PathField
+    from hiernav.nav.termination import ReplanRule, TerminationReason
     from hiernav.runtime.policy import make_agent
     from hiernav.sim.batch import BatchSim
     from hiernav.sim.layout import parse_world
@@ -46,11 +41,11 @@ _HOME = {
     "ObservationLayout": "hiernav.nav.observation",
     "OccupancyMap": "hiernav.nav.occupancy",
     "VisitMap": "hiernav.nav.occupancy",
-    "HierarchicalAgent": "hiernav.nav.option",
+    "HierarchicalAgent": "hiernav.nav.agent",
     "Planner": "hiernav.nav.option",
     "PlanQuery": "hiernav.nav.option",
-    "ReplanRule": "hiernav.nav.option",
-    "TerminationReason": "hiernav.nav.option",
+    "ReplanRule": "hiernav.nav.termination",
+    "TerminationReason": "hiernav.nav.termination",
     "WaypointOption": "hiernav.nav.option",
     "ShortestPathPlanner": "hiernav.nav.planners",
     "VerifiedPlanner": "hiernav.nav.planners",

@@ -19,10 +19,12 @@ import msgspec
 import numpy as np
 
 from hiernav.config import OptionConfig, TrainConfig, load_config
+from hiernav.nav.agent import Skill
 from hiernav.nav.bundle import MANIFEST, PLANNER, SKILL, file_sha256, load_bundle
 from hiernav.nav.occupancy import RESOLUTION
-from hiernav.nav.option import Planner, Skill, TerminationReason
+from hiernav.nav.option import Planner
 from hiernav.nav.planners import Network, VerifiedPlanner, verified_planner
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.policy import load_networks
 from hiernav.sim.factory import default_planner, expert_planner, make_task, skill_layout
 from hiernav.sim.layout import WorldSpec

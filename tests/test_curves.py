@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.reward import TERMS
 
 pytestmark = pytest.mark.train

@@ -26,8 +26,8 @@ from hiernav.evaluate import (
     wilson_interval,
 )
 from hiernav.nav.bundle import MANIFEST, BundleError
-from hiernav.nav.option import TerminationReason
 from hiernav.nav.planners import GoseloPlanner, ShortestPathPlanner, VerifiedPlanner
+from hiernav.nav.termination import TerminationReason
 from hiernav.run import RunError
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot

@@ -16,7 +16,7 @@ from hiernav.film.caption import LEAST_WIDTH, caption
 from hiernav.film.mujoco_view import MujocoView
 from hiernav.film.top_view import TopView
 from hiernav.film.writer import Writer, film_writer
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.factory import make_task
 from hiernav.sim.layout import WorldSpec
 from hiernav.sim.robots import get_robot

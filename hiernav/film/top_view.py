@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hiernav.draw import COLLISION, EDGE, GOAL, GREMLIN, OBSTACLE, PATH, PLAN, field_picture
 from hiernav.nav.lidar import LIDAR_BINS, lidar_closeness, surface_distance
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.layout import GREMLIN_HALF_SIZE
 from hiernav.sim.outline import Outlines
 from hiernav.sim.task import NavigationTask, TaskStep

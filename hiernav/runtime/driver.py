@@ -13,7 +13,7 @@ import numpy as np
 
 from hiernav.nav.goal import GoalRefused, place_goal
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.clock import Clock
 from hiernav.runtime.collision import time_to_collision
 from hiernav.runtime.driver_config import DriverConfig

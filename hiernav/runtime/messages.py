@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap, check_geometry
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.estimate import Estimate, Trust
 from hiernav.runtime.observe import Event, TickRecord
 from hiernav.runtime.robot import READINGS, SensorFrame, Truth

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.estimate import Estimate
 from hiernav.runtime.robot import SensorFrame, Truth
 from hiernav.runtime.supervisor import Mode

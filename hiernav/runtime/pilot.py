@@ -8,8 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, PlanQuery, TerminationReason
+from hiernav.nav.option import DeferredPlanner, PlanQuery
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.estimate import Estimate
 
 MAX_PLAN_AGE = 1.0

@@ -10,11 +10,13 @@ import numpy as np
 import onnxruntime as ort
 
 from hiernav.nav import goselo
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.bundle import PLANNER, SKILL, Bundle, BundleError, GoseloSpec, PlanSpec, TensorSpec
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import WAYPOINT_GUIDES
-from hiernav.nav.option import DeferredPlanner, HierarchicalAgent, Planner, ReplanRule, WaypointOption, refresh_steps
+from hiernav.nav.option import DeferredPlanner, Planner, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
+from hiernav.nav.termination import ReplanRule
 from hiernav.runtime.robot import Robot
 
 GOLDEN_TOLERANCE = 1e-5

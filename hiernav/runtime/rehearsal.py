@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import HierarchicalAgent, WaypointOption
+from hiernav.nav.option import WaypointOption
 from hiernav.nav.planners import StraightPlanner
 from hiernav.runtime.collision import time_to_collision
 from hiernav.runtime.estimate import Estimate, EstimatorConfig

@@ -9,8 +9,9 @@ import numpy as np
 from hiernav.config import ConfigError, TrainConfig
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import ObservationLayout
-from hiernav.nav.option import Planner, ReplanRule, WaypointOption, refresh_steps
+from hiernav.nav.option import Planner, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner
+from hiernav.nav.termination import ReplanRule
 from hiernav.sim.layout import Layout, WorldSpec, parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.task import LayoutSource, NavigationTask

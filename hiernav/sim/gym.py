@@ -11,7 +11,8 @@ import numpy as np
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.nav.goal import GOAL_RADIUS
-from hiernav.nav.option import Planner, TerminationReason
+from hiernav.nav.option import Planner
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.factory import make_task
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.task import NavigationTask

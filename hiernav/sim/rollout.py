@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hiernav.nav.agent import Skill
 from hiernav.nav.goal import GOAL_RADIUS
-from hiernav.nav.option import Skill, TerminationReason
 from hiernav.nav.path import arc_lengths
 from hiernav.nav.recovery import Recovery
 from hiernav.nav.search import PathField
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.layout import Layout
 from hiernav.sim.task import NavigationTask, TaskStep
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hiernav.config import RewardConfig
+from hiernav.nav.agent import observe
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.occupancy import OccupancyMap
-from hiernav.nav.option import OptionStep, WaypointOption, observe
+from hiernav.nav.option import OptionStep, WaypointOption
 from hiernav.nav.recovery import Recovery
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import Layout, WorldSpec, inside

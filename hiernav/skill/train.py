@@ -22,8 +22,9 @@ from tensordict import TensorDict
 from hiernav.config import SkillConfig, TrainConfig
 from hiernav.device import Recorded, choose_device, random_state, restore_random_state
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.option import Planner, TerminationReason
+from hiernav.nav.option import Planner
 from hiernav.nav.planners import COUNTS, VerifiedPlanner
+from hiernav.nav.termination import TerminationReason
 from hiernav.run import Run, RunError, TrainingDiverged
 from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.layout import parse_world

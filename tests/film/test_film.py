@@ -21,7 +21,7 @@ from hiernav.evaluate import Policies, evaluate
 from hiernav.film import film as film_module
 from hiernav.film.caption import LEAST_WIDTH, caption
 from hiernav.film.film import FilmSettings, film_name, film_names, make_film
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 

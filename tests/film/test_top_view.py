@@ -10,7 +10,7 @@ import pytest
 from hiernav.config import load_config
 from hiernav.draw import COLLISION, GREMLIN, PATH, PLAN, field_picture
 from hiernav.film.top_view import REPLAN_COLORS, TopView, rgb
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.factory import make_task
 from hiernav.sim.layout import Layout, parse_world
 from hiernav.sim.task import NavigationTask, TaskStep

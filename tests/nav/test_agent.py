@@ -7,9 +7,11 @@ import pytest
 from nav_planners import map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.frames import body_to_world
-from hiernav.nav.option import HierarchicalAgent, TerminationReason, WaypointOption
+from hiernav.nav.option import WaypointOption
 from hiernav.nav.planners import StraightPlanner
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.robots import get_robot
 
 NONE, START = TerminationReason.NONE, TerminationReason.START

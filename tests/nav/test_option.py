@@ -10,9 +10,10 @@ from nav_planners import WatchedPlanner, map_with_pillars
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes
-from hiernav.nav.option import ReplanRule, TerminationReason, WaypointOption
+from hiernav.nav.option import WaypointOption
 from hiernav.nav.path import nearest_vertex, polyline
 from hiernav.nav.planners import StraightPlanner
+from hiernav.nav.termination import ReplanRule, TerminationReason
 
 NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL, OUTDATED = TerminationReason
 FREE = map_with_pillars()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, draw_discs, empty_map
-from hiernav.nav.option import HierarchicalAgent, PlanQuery, WaypointOption
+from hiernav.nav.option import PlanQuery, WaypointOption
 from hiernav.nav.recovery import Recovery, ways_out
 from hiernav.sim.robots import get_robot
 

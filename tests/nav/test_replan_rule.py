@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hiernav.nav.option import ReplanRule, TerminationReason
+from hiernav.nav.termination import ReplanRule, TerminationReason
 
 NONE, START, D_UPDATE, HALF_INDEX, INVALID, GOAL, OUTDATED = TerminationReason
 DEFAULT = ReplanRule()

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.observation import ObservationLayout, ObservationTerm
 from hiernav.nav.occupancy import OccupancyMap, draw_boxes, empty_map
-from hiernav.nav.option import HierarchicalAgent, Planner, TerminationReason, WaypointOption
+from hiernav.nav.option import Planner, WaypointOption
+from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.delayed_planner import DelayedPlanner
 from hiernav.runtime.driver import Driver

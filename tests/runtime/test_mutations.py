@@ -182,7 +182,7 @@ MUTANTS = (
            "if False and not math.isclose(trained,", f"{T}/test_driver.py"),
     Mutant("bundle of another rate", "hiernav/nav/bundle.py", "if not abs(period - theirs) <= 1e-6:", "if False:",
            "tests/test_run_loop.py"),
-    Mutant("golden values", f"{R}/policy.py", "    check_golden(bundle, policies)\n", "    pass\n",
+    Mutant("golden values", f"{R}/policy.py", "    check_golden(bundle, networks)\n", "    pass\n",
            f"{T}/test_policy.py"),
     Mutant("fault without a goal", f"{R}/account.py", 'if event.kind == "fault" or mode == Mode.FAULT.value:',
            "if False:", f"{T}/test_account.py"),

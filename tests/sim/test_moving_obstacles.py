@@ -6,9 +6,10 @@ import numpy as np
 from small_tasks import Straight, facing_goal, still, task_of
 
 from hiernav.config import load_config
-from hiernav.nav.option import PlanQuery, TerminationReason
+from hiernav.nav.option import PlanQuery
 from hiernav.nav.planners import ShortestPathPlanner, VerifiedPlanner
 from hiernav.nav.prediction import AHEAD_S
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.task import NavigationTask
 
 CROSSING = facing_goal(start=(-1.0, 1.5, 0.0), gremlins=[(-0.5, 1.2)])

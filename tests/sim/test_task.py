@@ -10,7 +10,7 @@ from small_tasks import WORLD, Silent, Straight, facing_goal, still, task_of, te
 from hiernav.config import TrainConfig, load_config
 from hiernav.nav.frames import body_to_world
 from hiernav.nav.lidar import PILLAR_RADIUS, lidar_closeness
-from hiernav.nav.option import TerminationReason
+from hiernav.nav.termination import TerminationReason
 from hiernav.sim.factory import make_task
 from hiernav.sim.rollout import run_episodes
 from hiernav.sim.task import TaskStep

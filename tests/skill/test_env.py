@@ -14,7 +14,7 @@ pytest.importorskip("torchrl")
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
 from hiernav.config import load_config  # noqa: E402
-from hiernav.nav.option import TerminationReason  # noqa: E402
+from hiernav.nav.termination import TerminationReason  # noqa: E402
 from hiernav.sim.factory import make_task  # noqa: E402
 from hiernav.sim.layout import Layout, parse_world  # noqa: E402
 from hiernav.sim.reward import TERMS, weighted_sum  # noqa: E402

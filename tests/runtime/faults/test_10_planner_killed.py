@@ -18,8 +18,9 @@ from punctual import punctual
 from shipped import open_shipped
 from test_09_planner_hangs import QUERY, ask
 
+from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.occupancy import empty_map
-from hiernav.nav.option import HierarchicalAgent, WaypointOption
+from hiernav.nav.option import WaypointOption
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.estimate import EstimatorConfig
