@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
+from hiernav.runtime.doubts import Doubts
 from hiernav.runtime.estimate import Estimate, EstimatorConfig, Trust
 from hiernav.runtime.freshness import SensorWatch, TermWatch
 from hiernav.runtime.planar_filter import BIAS, POSITION, VELOCITY, YAW, PlanarFilter, X, Y, wrap
@@ -38,16 +39,6 @@ class _Accuracy(NamedTuple):
 
 _SAMPLED = _Accuracy(0.3, (0.3, 3.0))
 _INTEGRATED = _Accuracy(0.05, (1.0, 10.0))
-
-
-class _First(NamedTuple):
-    """A first reading, or the newest that took its place."""
-
-    reading: Sequence[float]
-    stamp: float
-    """Of its frame [s]."""
-    others: int
-    """Readings so far that did not agree with the one before."""
 
 
 class Estimator:
@@ -93,11 +84,7 @@ class Estimator:
         self._yaw_rate = 0.0
         self._rotation: Quaternion | None = None
         self._has_position = self._has_yaw = False
-        self._unsure: dict[str, _First] = {}
-        """By sensor, the first reading, as long as no other has agreed with it."""
-        self._rejected: Counter[str] = Counter()
-        self._rejected_at: dict[str, float] = {}
-        self._last_miss: dict[str, tuple[float, ...]] = {}
+        self._doubts = Doubts(config, self.counts)
         self._history = PositionHistory(config.history)
         # The accelerometer's noise is not the filter's business; its changes are told from noise all the same.
         sigmas = {name: getattr(config, f"{name}_sigma", 0.1) for name in VECTOR_SENSORS}
@@ -288,13 +275,13 @@ class Estimator:
         miss = wrap(yaw - self._filter.yaw)
         if not self._has_yaw:
             self._has_yaw = True
-            self._doubt("magnetometer", field)
+            self._doubts.begin("magnetometer", field, self._stamp)
             self._filter.replace((YAW,), (wrap(yaw),), variance)
         elif self._filter.correct_yaw(miss, variance, self._gate_1):
-            self._confirm("magnetometer", field, self.config.hold_after)
-        elif "magnetometer" in self._unsure:
+            self._doubts.confirm("magnetometer", field, self._stamp, self.config.hold_after)
+        elif "magnetometer" in self._doubts.unsure:
             self._filter.replace((YAW,), (wrap(yaw),), variance)
-            if not self._agrees_roughly("magnetometer", field, (miss,)):
+            if not self._doubts.agrees_roughly("magnetometer", field, (miss,), self._stamp):
                 return
         elif self._reject("magnetometer", (miss,)):
             self._filter.replace((YAW,), (wrap(yaw),), variance)
@@ -356,88 +343,47 @@ class Estimator:
         first, self._has_position = not self._has_position, True
         if not first and self._filter.correct_pair(POSITION, miss, variance, self._gate_2):
             self._history.shift(stamp, self._filter.x[X] - x, self._filter.x[Y] - y)
-            self._confirm("position_fix", fix, self.config.fix_hold_after if shown_again else 0.0)
+            patience = self.config.fix_hold_after if shown_again else 0.0
+            self._doubts.confirm("position_fix", fix, self._stamp, patience)
         else:
-            unsure = "position_fix" in self._unsure
+            unsure = "position_fix" in self._doubts.unsure
             if not (first or unsure or self._reject("position_fix", miss)):
                 return
             self._filter.replace(POSITION, (x + miss[0], y + miss[1]), variance)
             self._history.shift(-math.inf, *miss)
             if first:
-                self._doubt("position_fix", fix)
-            elif unsure and not self._agrees_roughly("position_fix", fix, miss):
+                self._doubts.begin("position_fix", fix, self._stamp)
+            elif unsure and not self._doubts.agrees_roughly("position_fix", fix, miss, self._stamp):
                 return
         self._accept("position_fix", stamp)
 
     def _accept(self, sensor: str, stamp: float) -> None:
         """A measurement taken at `stamp` [s] was used."""
-        self._rejected[sensor] = 0
+        self._doubts.accept(sensor)
         self._watch.believe(sensor, stamp)
 
     def _reject(self, sensor: str, miss: tuple[float, ...], spread: float | None = None) -> bool:
-        """Count a rejected measurement.
-
-        True if it is to be believed after all: there were so many in a row that the state must be wrong, and it agrees
-        to `spread` with the one before, so that it is no lone spike.
-        """
-        last = self._last_miss.get(sensor)
-        self._last_miss[sensor] = miss
-        agrees = last is not None and math.dist(miss, last) <= (spread or self.config.reinit_spread)
-        self.counts[f"{sensor}_rejected"] += 1
-        self._rejected[sensor] += 1
-        self._rejected_at[sensor] = self._stamp
-        if self._rejected[sensor] < self._patience(sensor) or not agrees:
+        """Count a rejected measurement; True if it is to be believed after all, as `Doubts.reject` says."""
+        if not self._doubts.reject(sensor, miss, self._stamp, spread or self.config.reinit_spread):
             return False
-        self.counts[f"{sensor}_reinit"] += 1
         moved = math.hypot(*miss) > self.config.reinit_spread
         self._starts += moved and sensor in ("position_fix", "magnetometer")
         return True
 
-    def _doubt(self, sensor: str, reading: Sequence[float], others: int = 0) -> None:
-        """Drive on no reading that may be a spike, before another agrees with it."""
-        if self.config.confirm:
-            self._unsure[sensor] = _First(reading, self._stamp, others)
-
-    def _confirm(self, sensor: str, reading: Sequence[float], patience: float) -> None:
-        """A reading agrees with the first. The same to the bit is that one shown again, unless it stays for long."""
-        first = self._unsure.get(sensor)
-        if first is not None and (reading != first.reading or self._stamp - first.stamp >= patience):
-            del self._unsure[sensor]
-
-    def _agrees_roughly(self, sensor: str, reading: Sequence[float], miss: tuple[float, ...]) -> bool:
-        """Whether a reading that takes the place of the first one is to be believed, though it does not pass the gate.
-
-        Only where many others did not either: then the sensor is noisier than it is said to be.
-        """
-        others = self._unsure[sensor].others + 1
-        self.counts[f"{sensor}_rejected"] += 1
-        self._rejected_at[sensor] = self._stamp
-        if others < self.config.reinit_after or math.hypot(*miss) > self.config.reinit_spread:
-            self._doubt(sensor, reading, others)
-            return False
-        del self._unsure[sensor]
-        return True
-
-    def _patience(self, sensor: str) -> int:
-        """Rejected measurements in a row after which the state must be wrong."""
-        return self.config.resync_after if sensor in ("velocimeter", "gyro") else self.config.reinit_after
-
-    def _may_yet_be_believed(self, sensor: str) -> bool:
-        """Whether a sensor speaks, is rejected, and has not had as many measurements as would be believed after all."""
-        speaks = self._stamp - self._rejected_at.get(sensor, -math.inf) < self.config.hold_after
-        unsure = sensor in self._unsure and self._unsure[sensor].others < self.config.reinit_after
-        return speaks and (unsure or 0 < self._rejected[sensor] < self._patience(sensor))
-
     def _trust(self) -> tuple[Trust, str]:
         """What the estimate is good for, judged by the sensor that has been silent for too long."""
         worst, why = Trust.GOOD, ""
-        for name in self._unsure:  # a first reading may be a spike
+        for name in self._doubts.unsure:  # a first reading may be a spike
             worst, why = Trust.HOLD, f"{name}: no second reading that agrees with the first yet"
         for name, hold, lost in self._limits:
             silence = self._watch.silence(name, self._stamp)
             if silence < hold:
                 continue
-            trust = Trust.LOST if silence >= lost and not self._may_yet_be_believed(name) else Trust.HOLD
+            trust = (
+                Trust.LOST
+                if silence >= lost and not self._doubts.may_yet_be_believed(name, self._stamp)
+                else Trust.HOLD
+            )
             if trust > worst:
                 flaw = self._flaws.get(name)
                 worst, why = trust, f"{name} says nothing usable for {silence:.2f} s{f' ({flaw})' if flaw else ''}"
