@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from hiernav.runtime.loop import STOP_SIGNALS
@@ -19,7 +20,7 @@ class Child:
     """A Python process that runs a module of this package, of this process's kin and in a session of its own.
 
     A terminal's Ctrl-C does not reach it, and it leaves signals to this process (`leave_signals_to_parent`): it ends
-    when its `news` pipe is closed, be it by `close` or because this process is gone.
+    when its `news` pipe is closed, be it by `close` or because this process is gone. What it prints goes to stderr.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Child:
                 [sys.executable, "-m", module, str(news), *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(news, *descriptors),
+                stdout=_stderr(),
                 start_new_session=True,
                 env={**os.environ, **ONE_THREAD, **(environment or {}), "PYTHONPATH": path},
             )
@@ -57,17 +59,36 @@ class Child:
         except (BlockingIOError, BrokenPipeError):
             pass
 
-    def close(self, patience: float = 2.0) -> None:
-        """Have it end by itself, or kill it after `patience` [s]."""
+    def close(self, patience: float = 2.0, family: bool = False) -> bool:
+        """Have it end by itself, or kill it after `patience` [s]; `family`: and what it has started and left behind.
+
+        Returns:
+            Whether it has ended by itself.
+        """
         if self._news < 0:
-            return
+            return True
         os.close(self._news)
         self._news = -1
+        ended = True
         try:
             self.process.wait(patience)
         except subprocess.TimeoutExpired:
+            ended = False
             self.process.kill()
             self.process.wait()
+        if family:
+            with suppress(ProcessLookupError, PermissionError):  # nobody of its session is left
+                os.killpg(self.process.pid, signal.SIGKILL)
+        return ended
+
+
+def _stderr() -> int | None:
+    """Where a child prints, as this process's own output may be read by a program; None where there is no stderr."""
+    try:
+        os.fstat(2)
+    except OSError:
+        return None
+    return 2
 
 
 def leave_signals_to_parent() -> None:

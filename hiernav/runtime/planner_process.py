@@ -27,6 +27,8 @@ from hiernav.runtime.policy import OnnxPlannerNetwork, PlannerSettings
 
 MAX_RESTARTS = 3
 RESTART, FORGIVE = b"r", b"f"
+START_AGAIN = 0.1
+"""Where the system had no room for another process, it is asked again after this long [s]."""
 
 
 def main() -> None:
@@ -38,10 +40,10 @@ def main() -> None:
 def keep(news: int, questions: int, memory: PlannerMemory) -> None:
     """Keep one planner running until the control process closes `news`, with `MAX_RESTARTS` restarts."""
     gc.freeze()
-    planner = _start(news, questions, memory)
-    watched = os.pidfd_open(planner)
+    planner, watched = _start(news, questions, memory)
     while True:
-        ready = select.select([news, watched] if watched >= 0 else [news], [], [])[0]
+        wait = None if planner or memory.status.exhausted else START_AGAIN
+        ready = select.select([news, watched] if watched >= 0 else [news], [], [], wait)[0]
         wish = wait_for_news(news, 0.0) if news in ready else b""
         if wish is None:
             break
@@ -58,16 +60,19 @@ def keep(news: int, questions: int, memory: PlannerMemory) -> None:
             memory.set_status("exhausted", int(exhausted))  # before the start, by which it is told to be over
             if not exhausted:
                 memory.set_status("restarts", memory.status.restarts + 1)
-                planner = _start(news, questions, memory)
-                watched = os.pidfd_open(planner)
+                planner, watched = _start(news, questions, memory)
     if planner:
         os.kill(planner, signal.SIGKILL)
         os.waitpid(planner, 0)
 
 
-def _start(news: int, questions: int, memory: PlannerMemory) -> int:
+def _start(news: int, questions: int, memory: PlannerMemory) -> tuple[int, int]:
+    """Number and descriptor of a new planner; 0 and -1 where the system has no room for one."""
     memory.set_status("starts", memory.status.starts + 1)
-    pid = os.fork()
+    try:
+        pid = os.fork()
+    except OSError:
+        return 0, -1
     if pid == 0:
         code = 1
         try:
@@ -78,7 +83,7 @@ def _start(news: int, questions: int, memory: PlannerMemory) -> int:
         finally:
             os._exit(code)
     memory.set_status("pid", pid)
-    return pid
+    return pid, os.pidfd_open(pid)
 
 
 def make_planner(memory: PlannerMemory) -> Planner:

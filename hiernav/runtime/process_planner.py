@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import msgspec
@@ -74,10 +75,9 @@ class ProcessPlanner:
         """How long the planner took, as it says itself."""
         self._descriptor = shared_memory(PlannerMemory.size(map_pixels, waypoints, settings, bundle.planner))
         self._memory = PlannerMemory.create(mapped(self._descriptor), map_pixels, waypoints, settings, bundle.planner)
-        read, self._questions = os.pipe()
+        self._asked_at, self._questions = os.pipe()
         os.set_blocking(self._questions, False)
-        self._child = Child("hiernav.runtime.planner_process", (read, self._descriptor), (read, self._descriptor))
-        os.close(read)
+        self._child = self._start_keeper()
         self._asked: OrderedDict[int, _Asked] = OrderedDict()
         self._number = self._wanted_from = 0
         self._map: OccupancyMap | None = None
@@ -116,8 +116,15 @@ class ProcessPlanner:
 
     def renew(self) -> None:
         self._renewed_after = self.status.starts
-        self._child.nudge(b"f")
         self._silent_since = None
+        if self._child.ended is None:
+            self._child.nudge(b"f")
+            return
+        self._child.close(family=True)
+        for field in ("restarts", "ready"):  # nobody else writes them now
+            self._memory.set_status(field, 0)
+        with suppress(OSError):  # the system has no room for another process: it stays failed
+            self._child = self._start_keeper()
 
     def plan(self, query: PlanQuery) -> None:
         """Ask with the newest state; the answer comes by `answer`."""
@@ -170,8 +177,14 @@ class ProcessPlanner:
         if self._questions >= 0:
             os.close(self._questions)
             self._questions = -1
-            self._child.close()
+            os.close(self._asked_at)
+            self._child.close(family=True)
             os.close(self._descriptor)
+
+    def _start_keeper(self) -> Child:
+        self._starts_before = self.status.starts
+        descriptors = (self._asked_at, self._descriptor)
+        return Child("hiernav.runtime.planner_process", descriptors, descriptors)
 
     def _count(self, start: int, counts: Mapping[str, int]) -> None:
         if start != self._newest_start:
@@ -180,7 +193,7 @@ class ProcessPlanner:
 
     def _watch(self, now: float) -> None:
         """Have a planner that hangs started again."""
-        if not self._asked or not self.status.starts:  # before the first start the keeper itself is being loaded
+        if not self._asked or self.status.starts == self._starts_before:  # the keeper itself is still being loaded
             self._silent_since = None
         elif self._silent_since is None:
             self._silent_since = now

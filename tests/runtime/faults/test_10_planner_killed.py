@@ -21,11 +21,14 @@ from test_09_planner_hangs import QUERY, ask
 from hiernav.nav.agent import HierarchicalAgent
 from hiernav.nav.occupancy import empty_map
 from hiernav.nav.option import WaypointOption
+from hiernav.runtime import planner_process
 from hiernav.runtime.clock import MonotonicClock
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.estimate import EstimatorConfig
 from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.mailbox import mapped, shared_memory
 from hiernav.runtime.pilot import Pilot
+from hiernav.runtime.planner_memory import PlannerMemory
 from hiernav.runtime.process_planner import ProcessPlanner
 
 PERIOD = 0.02
@@ -82,6 +85,49 @@ def test_a_keeper_that_is_killed_is_a_fault_and_takes_its_planner_along():
     finally:
         planner.close()
     wait_for_the_end_of(child)
+
+
+def test_a_keeper_that_was_killed_is_replaced_once_somebody_acknowledges():
+    planner = ProcessPlanner(open_shipped("point"), 0.1, 6400)
+    try:
+        first, stopped = ask(planner), planner.status.pid
+        os.kill(stopped, signal.SIGSTOP)  # it cannot see that its keeper is gone
+        planner._child.process.kill()
+        planner._child.process.wait()
+        planner.renew()
+        assert planner.failed is None
+        np.testing.assert_allclose(ask(planner).plan, first.plan, atol=0.05)
+        assert planner.restart_count() == 0 and planner.status.starts == 2
+        wait_for_the_end_of(stopped)
+        os.kill(planner.status.pid, signal.SIGSTOP)
+        os.kill(planner._child.process.pid, signal.SIGSTOP)
+        last = planner._child.process.pid, planner.status.pid
+    finally:
+        planner.close()
+    wait_for_the_end_of(*last)
+
+
+def test_a_planner_is_started_again_where_the_system_had_no_room_for_it(monkeypatch):
+    news, wake = os.pipe()
+    settings, model = b"{}", b""
+    memory = PlannerMemory.create(
+        mapped(shared_memory(PlannerMemory.size(64, 10, settings, model))), 64, 10, settings, model
+    )
+    started: list[subprocess.Popen[bytes]] = []
+
+    def fork() -> int:
+        if memory.status.starts < 2:
+            raise BlockingIOError("no room")
+        started.append(subprocess.Popen(["sleep", "60"]))
+        os.close(wake)  # and that is the end
+        return started[-1].pid
+
+    monkeypatch.setattr(planner_process.os, "fork", fork)
+    planner_process.keep(news, -1, memory)
+    assert memory.status.starts == 2 and memory.status.restarts == 1 and not memory.status.exhausted
+    assert not _alive(started[0].pid)
+    started[0].wait()
+    os.close(news)
 
 
 def test_signals_are_left_to_the_control_process_and_without_it_keeper_and_planner_end():
