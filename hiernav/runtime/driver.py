@@ -146,6 +146,7 @@ class Driver:
         """Whether the robot was seen to stand at the end of the last run."""
         self._truth: Callable[[], Truth | None] | None = getattr(robot, "truth", None)
         self._stands: Callable[[], None] = getattr(robot, "stands", lambda: None)
+        self._trouble: Callable[[], str | None] = getattr(robot, "trouble", lambda: None)
         self._requests = Requests()
         self._trip: Trip | None = None
         self._ended: Trip | None = None
@@ -273,13 +274,16 @@ class Driver:
             if self._trip is not None:
                 self._end_trip("interrupted", self.clock.now())
             self.audience.tell(lambda observer: observer.flush(FLUSH_SECONDS))
-            self.stopped = stopped = self._stop()
+            stopped = self._stop()
+            self.stopped = bool(stopped)
             if stopped:
                 self._stands()
             if self._ended is not None:
-                if not stopped:
+                if stopped is None:
+                    self._fail("nobody can see whether the robot stands", self.clock.now())
+                elif not stopped:
                     self._does_not_stop(self.clock.now())
-                self.last_result = self._result(self._ended, stopped)
+                self.last_result = self._result(self._ended, self.stopped)
             if not self.supervisor.latched and self.supervisor.mode is not Mode.INIT:
                 self.supervisor.change(Mode.INIT, "the loop has ended", self.clock.now())
 
@@ -344,7 +348,7 @@ class Driver:
             raise
         self._take_requests(now)
         trust, doubt = self._run.blind.check(estimate, now, self.estimator.lacks)
-        wait = self._run.overruns.check(self.loop.overruns_in_a_row)
+        wait = self._run.overruns.check(self.loop.overruns_in_a_row) or self._trouble()
         stamp = frame.stamp if estimate is None else estimate.stamp
         if self._trip is not None:
             self._trip.last = stamp
@@ -671,8 +675,9 @@ class Driver:
             planner=dict(self._planner_counts() - planner),
         )
 
-    def _stop(self) -> bool:
-        """Brake until the measured speed shows that the robot stands; False if it could not be shown in time."""
+    def _stop(self) -> bool | None:
+        """Brake until the measured speed shows that the robot stands; False if it does not in time, None if it cannot
+        be read."""
         watch = StopWatch(self.config.stop_speed, self.config.stop_turn, self.config.stop_timeout)
         watch.begin(self.clock.now())
         stopped: bool | None = None
@@ -690,7 +695,7 @@ class Driver:
             FixedRateLoop(self.clock, self.robot.control_period, tick, self.robot.brake, handle_signals=False).run()
         except Exception:
             log.exception("the stop could not be verified")
-            return False
+            return None
         return bool(stopped)
 
 

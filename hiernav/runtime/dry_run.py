@@ -97,6 +97,8 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings)
     lidar = np.concatenate([np.ravel(value) for value in given.get("lidar", [])] or [np.zeros(1)])
     if (lidar < 0.0).any() or (lidar > 1.0).any():
         errors.append(f"lidar reads {lidar.min():g} to {lidar.max():g}, closeness in [0, 1] is expected")
+    trouble = robot.trouble()
+    errors += [trouble] if trouble else []
     wrong = _wrong_sizes({name: values[-1] for name, values in given.items()}, bundle)
     errors += [f"sensors of another size: {', '.join(wrong)}"] if wrong else []
     try:
@@ -119,6 +121,7 @@ def _check_robot(robot: ProcessRobot, bundle: Bundle | None, settings: Settings)
 def _look(robot: ProcessRobot, needed: Sequence[str]) -> tuple[list[SensorFrame], float]:
     """The frames that a robot shows, and how long it was listened to [s]."""
     clock = MonotonicClock()
+    robot.brake()  # a simulated one lives from its first command on
     began, frames = clock.now(), [robot.read()]
     missing = set(needed) - set(_readings(frames[0]))
     while (now := clock.now()) < began + (PATIENCE if missing else LOOK):

@@ -19,8 +19,11 @@ from hiernav.runtime.child import Child
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import END, STATUS, TAKEN, TRIPS
+from hiernav.runtime.robot_process import END, SLOW, STATUS, TAKEN, TRIPS
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command
+
+CLOSING = 5.0
+"""Time that the robot's own `close`, and what it does just then, may take [s]."""
 
 
 def simulated(realtime: RealtimeConfig | None = None, **arguments: Any) -> ProcessRobot:
@@ -58,7 +61,7 @@ class ProcessRobot:
         size = STATUS + 2 * Mailbox.size(CAPACITY)
         self._descriptor = shared_memory(size)
         memory = self._memory = mapped(self._descriptor)
-        self._status = np.frombuffer(memory, np.float64, 2)
+        self._status = np.frombuffer(memory, np.float64, 3)
         self._commands = Mailbox(memory, STATUS, CAPACITY)
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._calls, theirs = socket.socketpair()
@@ -76,6 +79,9 @@ class ProcessRobot:
         self._message: bytes | None = None
         self._newest: tuple[SensorFrame, Truth | None] | None = None
         self._driven = False
+        self._last_words = b""
+        self.killed = False
+        """Whether the adapter did not end by itself, and was killed: nothing here has braked the robot since."""
 
     @property
     def control_period(self) -> float:
@@ -94,6 +100,11 @@ class ProcessRobot:
     def watchdog_trips(self) -> int:
         """How often the adapter braked because no command came."""
         return int(self._status[TRIPS])
+
+    def trouble(self) -> str | None:
+        """Why the robot must not be driven now, as the adapter sees it; None if it may be."""
+        slow = float(self._status[SLOW])
+        return f"the adapter keeps commands waiting for {slow:.2f} s: its read or send is too slow" if slow else None
 
     def read(self) -> SensorFrame:
         """The newest frame; the first one is waited for.
@@ -162,7 +173,7 @@ class ProcessRobot:
         if self._descriptor >= 0:
             if not self._driven:
                 self.child.nudge(END)
-            self.child.close(patience=5.0)
+            self.killed = not self.child.close(CLOSING)
             self._calls.close()
             os.close(self._descriptor)
             self._descriptor = -1
@@ -186,8 +197,12 @@ class ProcessRobot:
         return message
 
     def _require_adapter(self) -> None:
-        if self.child.ended is not None:
-            raise RobotGone(f"the robot's adapter ended with status {self.child.ended}")
+        if self.child.ended is None:
+            return
+        with suppress(OSError):  # what it said at last may have come meanwhile
+            while select.select([self._calls], [], [], 0.0)[0] and (part := self._calls.recv(65536)):
+                self._last_words += part
+        raise RobotGone(f"the robot's adapter ended with status {self.child.ended}{_why(self._last_words)}")
 
     def _receive(self) -> dict[str, Any]:
         line, end = b"", time.monotonic() + self._patience
@@ -208,4 +223,19 @@ class ProcessRobot:
                 self._require_adapter()
                 raise RobotGone("the robot's adapter does not answer any more")
             line += part
-        return json.loads(line)
+        answer = json.loads(line.split(b"\n")[0])
+        if "gone" in answer:  # it fails while it is asked for something
+            self._last_words = line
+            with suppress(subprocess.TimeoutExpired):
+                self.child.process.wait(5.0)
+            self._require_adapter()
+            raise RobotGone(f"the robot's adapter fails{_why(line)}")
+        return answer
+
+
+def _why(last_words: bytes) -> str:
+    """What an adapter said before it ended, to be put behind that it did."""
+    for line in reversed(last_words.split(b"\n")):
+        with suppress(ValueError, KeyError, TypeError):
+            return f": {json.loads(line)['gone']}"
+    return ""

@@ -2,8 +2,7 @@
 
 Run as `python -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to the
 control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot. Where the robot's own
-code fails, this process brakes the robot before it ends. A robot that cannot be made or read at all is told to the
-control process in one line.
+code fails, this process brakes the robot before it ends, and tells the control process why in one line.
 """
 
 from __future__ import annotations
@@ -11,16 +10,18 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import math
 import os
 import select
 import sys
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import numpy as np
@@ -35,10 +36,13 @@ from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
 END = b"e"
 """News that this process is not needed any more, and that the robot stands."""
 STATUS = 64
-"""Bytes at the front of the memory, of which `TRIPS` and `TAKEN` are in use."""
-TRIPS, TAKEN = 0, 1
-"""Places in there of how often the watchdog braked, and of the number of the newest frame that the loop has taken. The
-control process writes the latter."""
+"""Bytes at the front of the memory, of which the following places are in use."""
+TRIPS, TAKEN, SLOW = 0, 1, 2
+"""How often the watchdog braked; the number of the newest frame that the loop has taken, which the control process
+writes; how long the robot's code keeps commands waiting, 0 where it is quick enough [s]."""
+LATE_LOOKS, LATE_WITHIN = 5, 2.0
+"""A robot is too slow to be driven that has kept commands waiting, longer than it may drive on without one, so often
+within so long [s]. Once may be the machine."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
 LAST_BRAKES = 1.0
@@ -56,9 +60,17 @@ def main() -> None:
     except BaseException as error:
         if _frames(error):
             _tell([error])
-        os.write(calls, _refusal(f"adapter {settings['robot']!r}: {_one_line(error)}"))
-        sys.exit(1)
-    sys.exit(adapter.run())
+        with suppress(OSError):
+            os.write(calls, _refusal(f"adapter {settings['robot']!r}: {_one_line(error)}"))
+        _leave(1)
+    _leave(adapter.run())
+
+
+def _leave(status: int) -> NoReturn:
+    """End at once: threads that the robot's code has started, and never ended, must not keep this process."""
+    with suppress(Exception):
+        sys.stdout.flush()
+    os._exit(status)
 
 
 class AdapterError(ValueError):
@@ -105,7 +117,7 @@ class Adapter:
         self.watchdog = CommandWatchdog(self._period)
         self._news, self._calls = news, calls
         memory = self._memory = mapped(descriptor)
-        self._status = np.frombuffer(memory, np.float64, 2)
+        self._status = np.frombuffer(memory, np.float64, 3)
         self._commands = Mailbox(memory, STATUS, CAPACITY)
         self._frames = Mailbox(memory, STATUS + Mailbox.size(CAPACITY), CAPACITY)
         self._truth = getattr(robot, "truth", None)
@@ -113,6 +125,8 @@ class Adapter:
         self._fix: tuple[np.ndarray, float] | None = None
         self._gathering = Gathering(self._period)
         self._braked = 0.0
+        self._looked = math.inf
+        self._late: deque[tuple[float, float]] = deque(maxlen=LATE_LOOKS)
         self._introduced = False
 
     def run(self) -> int:
@@ -128,16 +142,16 @@ class Adapter:
                 last_brakes = 0.0
         except BaseException as error:
             failures.append(error)
-            if not self._introduced:  # the control process still waits for that
-                with suppress(OSError):
-                    os.write(self._calls, _refusal(f"the robot's adapter cannot start: {_one_line(error)}"))
+            if self._introduced:
+                self._answer({"gone": _one_line(error)})
+            else:  # the control process still waits for that
+                self._answer({"error": f"the robot's adapter cannot start: {_one_line(error)}"})
         failures += self._brake_for(last_brakes)
-        _tell(failures)  # not before: there may be nobody who reads it
         try:
             self.robot.close()
         except BaseException as error:
             failures.append(error)
-            _tell([error])
+        _tell(failures)  # not before: there may be nobody who reads it
         return 1 if failures else 0
 
     def _follow(self) -> bool:
@@ -147,12 +161,15 @@ class Adapter:
         period, action_dim = float(robot.control_period), int(robot.action_dim)
         facts = {"control_period": period, "action_dim": action_dim, "realtime": granted}
         self._publish()
-        self._answer(facts)
+        if not self._answer(facts):
+            return False
         self._introduced = True
         while True:
             ready = select.select([self._news, self._calls], [], [], idle)[0]
-            if self._calls in ready and not self._take_call():
-                return False
+            if self._calls in ready:
+                if not self._take_call():
+                    return False
+                self._looked = math.inf  # nobody drives it meanwhile
             news = wait_for_news(self._news, 0.0) if self._news in ready else b""
             if news is None:
                 return False
@@ -177,6 +194,7 @@ class Adapter:
 
     def _obey(self, now: float) -> None:
         """Follow a new command; brake if it was given too long ago, or if there is none and the last one is too old."""
+        self._watch_pace(now)
         message = self._commands.get()
         if message is not None:
             command, given = decode_command(message)
@@ -198,6 +216,14 @@ class Adapter:
             elif trips and now - self._braked >= self._period:
                 self.robot.brake()
                 self._braked = now
+
+    def _watch_pace(self, now: float) -> None:
+        """Tell the control process of a robot whose `read` or `send` keeps its commands waiting again and again."""
+        if now - self._looked > self.watchdog.timeout:
+            self._late.append((now, now - self._looked))
+        self._looked = now
+        often = len(self._late) == LATE_LOOKS and now - self._late[0][0] <= LATE_WITHIN
+        self._status[SLOW] = max(gap for _, gap in self._late) if often else 0.0
 
     def _publish(self) -> None:
         frame = self.robot.read()
@@ -237,11 +263,15 @@ class Adapter:
         self._shown = self._fix = None
         self._gathering.forget()
         self._publish()
-        self._answer(answer)
-        return True
+        return self._answer(answer)
 
-    def _answer(self, answer: dict[str, Any]) -> None:
-        os.write(self._calls, json.dumps(answer).encode() + b"\n")
+    def _answer(self, answer: dict[str, Any]) -> bool:
+        """False if nobody is there any more who could take it."""
+        try:
+            os.write(self._calls, json.dumps(answer).encode() + b"\n")
+        except OSError:
+            return False
+        return True
 
 
 def _refusal(why: str) -> bytes:

@@ -16,21 +16,24 @@ PERIOD = 0.02
 class ScriptedRobot:
     """Notes "send", "brake" and "close" with the monotonic time in a file, unbuffered.
 
-    What `fails` names works `good` times, then raises `failures` times. The first reading takes `slow` seconds.
+    What `fails` names works `good` times, then raises `failures` times. The first `slow_reads` readings take `slow`
+    seconds each.
     """
 
     control_period = PERIOD
     action_dim = 2
 
-    def __init__(self, path: str, fails: str = "", good: int = 0, failures: int = 1, slow: float = 0.0) -> None:
+    def __init__(
+        self, path: str, fails: str = "", good: int = 0, failures: int = 1, slow: float = 0.0, slow_reads: int = 1
+    ) -> None:
         self._file = open(path, "ab", buffering=0)
         self._fails, self._good, self._failures = fails, good, failures
-        self._done, self._slow = 0, slow
+        self._done, self._slow, self._slow_reads = 0, slow, slow_reads
 
     def read(self) -> SensorFrame:
         self._try("read")
-        time.sleep(self._slow)
-        self._slow = 0.0
+        time.sleep(self._slow if self._slow_reads > 0 else 0.0)
+        self._slow_reads -= 1
         still = np.zeros(3)
         return SensorFrame(time.monotonic(), still, still, np.array([0.0, -0.5, 0.0]), still, position_fix=np.zeros(2))
 

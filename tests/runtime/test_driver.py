@@ -560,6 +560,32 @@ def test_commands_get_through_where_the_robot_cannot_be_read():
     assert set(modes[40:50]) == {Mode.FAULT}, "acknowledged, but the cause is not gone"
 
 
+def test_a_robot_that_says_it_is_in_trouble_waits_and_goes_on():
+    robot, seen = Puck(noise=1e-3), Listener()
+    robot.trouble = lambda: "the adapter is slow" if 10 <= len(robot.log) < 30 else None
+    result = driver_of(robot, observers=[seen]).run(GOAL)
+    assert result.reached and result.holds == {"the adapter is slow": 1}
+    held = [record for record in seen.records if record.mode is Mode.HOLD]
+    assert len(held) == 10 and all(record.sent is None for record in held)
+
+
+@pytest.mark.parametrize("error", [RobotGone("it ended: bus error"), OSError("bus error")])
+def test_a_stop_that_nobody_can_see_is_not_said_to_last_too_long(error):
+    robot = Puck(noise=1e-3)
+    read, robot.failing = robot.read, False
+
+    def failing() -> SensorFrame:
+        robot.failing |= len(robot.sent) >= 5
+        if robot.failing:
+            raise error
+        return read()
+
+    robot.read = failing
+    result = driver_of(robot).run(GOAL)
+    assert not result.stopped and "bus error" in result.fault
+    assert "nobody can see whether the robot stands" in result.fault and "does not stop" not in result.fault
+
+
 def test_a_robot_that_is_gone_ends_the_service():
     class Gone(Puck):
         def read(self) -> SensorFrame:

@@ -20,6 +20,10 @@ class Still(Puck):
     """A robot that is braked, and whose time goes on."""
 
     realtime: dict[str, str] = {}
+    slow: str | None = None
+
+    def trouble(self) -> str | None:
+        return self.slow
 
     def read(self) -> SensorFrame:
         self.brake()
@@ -53,6 +57,11 @@ def test_what_is_wrong_with_a_sensor_is_an_error_that_names_it(monkeypatch, read
     found = found_of(monkeypatch, lambda frame: replace(frame, **readings))
     assert found["control period"] == "20 ms"
     assert ("error" in found) == (error is not None) and (error or "") in found.get("error", "")
+
+
+def test_a_robot_that_keeps_commands_waiting_is_an_error(monkeypatch):
+    monkeypatch.setattr(Still, "slow", "the adapter keeps commands waiting for 0.12 s")
+    assert "keeps commands waiting for 0.12 s" in found_of(monkeypatch, lambda frame: frame)["error"]
 
 
 def test_a_sensor_that_speaks_seldom_is_not_silent(monkeypatch):

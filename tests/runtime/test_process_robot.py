@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -18,13 +19,14 @@ from hypothesis import strategies as st
 from puck import Puck
 from shipped import ROOT
 
+from hiernav.runtime import process_robot
 from hiernav.runtime.estimate import EstimatorConfig
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.mailbox import Mailbox, mapped, shared_memory
 from hiernav.runtime.process_robot import ProcessRobot, simulated
 from hiernav.runtime.realtime import RealtimeConfig
 from hiernav.runtime.robot import RobotGone, SensorFrame, Truth
-from hiernav.runtime.robot_process import LAST_BRAKES, STATUS, Adapter, make_robot
+from hiernav.runtime.robot_process import LAST_BRAKES, SLOW, STATUS, Adapter, make_robot
 from hiernav.runtime.settings import load_settings
 from hiernav.runtime.wire import CAPACITY, decode_frame, encode_command, encode_frame
 
@@ -241,6 +243,94 @@ def test_an_adapter_that_ends_is_an_error_at_the_next_read(tmp_path):
     with pytest.raises(RobotGone, match="adapter ended with status -9"):
         robot.call("restart", seed=1)
     robot.close()
+
+
+THREADED = """
+import sys, threading, time
+sys.path.insert(0, {folder!r})
+import scripted_robot
+
+def make(**manners):
+    threading.Thread(target=time.sleep, args=(600.0,)).start()  # as drivers of serial ports and the like do
+    print("connected")
+    return scripted_robot.make({log!r}, **manners)
+"""
+
+
+@pytest.mark.parametrize("fails", ["", "read"])
+def test_a_thread_that_the_robots_driver_leaves_running_keeps_no_process(tmp_path, capfd, fails):
+    file, log = tmp_path / "threaded.py", tmp_path / "log"
+    file.write_text(THREADED.format(folder=str(Path(__file__).parent), log=str(log)))
+    robot = ProcessRobot(f"{file}:make", {"fails": fails, "good": 3})
+    try:
+        robot.read()
+        if fails:
+            with pytest.raises(RobotGone, match=r"ended with status 1: OSError: read: bus error \(scripted_robot.py:"):
+                while True:
+                    robot.read()
+                    time.sleep(0.005)
+    finally:
+        robot.close()
+    assert not robot.killed and log.read_text().split()[-2] == "close"
+    said = capfd.readouterr()
+    assert said.out == "" and "connected" in said.err  # the standard output is this process's own
+
+
+def test_an_adapter_that_does_not_end_is_killed_and_that_is_known(tmp_path, monkeypatch):
+    file = tmp_path / "stuck.py"
+    file.write_text(
+        THREADED.format(folder=str(Path(__file__).parent), log=str(tmp_path / "log"))
+        + "\nscripted_robot.ScriptedRobot.close = lambda self: time.sleep(600.0)\n"
+    )
+    monkeypatch.setattr(process_robot, "CLOSING", 0.2)
+    robot = ProcessRobot(f"{file}:make")
+    robot.read()
+    robot.close()
+    assert robot.killed
+
+
+def test_a_robot_that_was_made_too_late_is_released_without_a_word(capfd):
+    memory, robot = shared_memory(STATUS + 2 * Mailbox.size(CAPACITY)), Puck(control_period=0.02)
+    calls, ours = socket.socketpair()
+    calls.close()
+    news, wake = os.pipe()
+    adapter = Adapter(robot, news, ours.fileno(), memory)
+    assert adapter.run() == 0 and robot.log[-1] == "close" and "send" not in robot.log
+    assert capfd.readouterr().err == ""
+    for each in (news, wake, memory):
+        os.close(each)
+    ours.close()
+
+
+def test_a_robot_that_keeps_commands_waiting_again_and_again_is_told_of():
+    memory = shared_memory(STATUS + 2 * Mailbox.size(CAPACITY))
+    adapter, status = Adapter(Puck(control_period=0.02), -1, -1, memory), np.frombuffer(mapped(memory), np.float64, 3)
+
+    def looked(*gaps: float) -> float:
+        for gap in gaps:
+            looked.now += gap
+            adapter._obey(looked.now)
+        return float(status[SLOW])
+
+    looked.now = 0.0
+    assert looked(*[0.045] * 40) == 0.0, "as fast as a robot may be left alone"
+    assert looked(0.3, *[0.005] * 100, 0.2, 0.2, 0.2) == 0.0, "now and then, as a busy machine does"
+    assert looked(0.12) == pytest.approx(0.3) and looked(0.12) == pytest.approx(0.2)
+    assert looked(*[0.12] * 10) == pytest.approx(0.12)
+    assert looked(*[0.01] * 140) == pytest.approx(0.12) and looked(*[0.01] * 60) == 0.0
+    os.close(memory)
+
+
+def test_the_control_process_knows_of_a_robot_that_is_too_slow(tmp_path):
+    robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log"), "slow": 0.12, "slow_reads": 1000})
+    try:
+        robot.read()
+        end = time.monotonic() + 20.0
+        while robot.trouble() is None and time.monotonic() < end:
+            time.sleep(0.01)
+        assert "keeps commands waiting for 0." in robot.trouble()
+    finally:
+        robot.close()
 
 
 @pytest.mark.parametrize(
