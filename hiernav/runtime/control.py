@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import math
@@ -13,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -135,22 +137,12 @@ class ControlServer:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if path.parent.stat().st_uid != os.getuid():
             raise ValueError(f"control socket {path}: the folder belongs to another user")
-        if path.exists():
-            if not stat.S_ISSOCK(path.stat().st_mode):
-                raise ValueError(f"control socket {path}: there is something else")
-            if _answers(path):
-                raise ValueError(f"control socket {path}: another loop listens there")
-            path.unlink(missing_ok=True)
-        self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        before = os.umask(0o177)
+        self._lock = _Lock(path)
         try:
-            self._server.bind(str(path))
-        except OSError as error:
-            raise ValueError(f"control socket {path}: {error}") from None
-        finally:
-            os.umask(before)
-        self._server.listen(CLIENTS)
-        self._server.setblocking(False)
+            self._server = self._listening()
+        except BaseException:
+            self._lock.release()
+            raise
         self._closed = False
         self._thread = threading.Thread(target=self._listen, name="control", daemon=True)
 
@@ -164,6 +156,29 @@ class ControlServer:
         self._thread.join(2.0)
         self._server.close()
         self.path.unlink(missing_ok=True)
+        self._lock.release()
+
+    def _listening(self) -> socket.socket:
+        """The socket, in the place of what a dead loop left."""
+        path = self.path
+        if path.is_symlink() or path.exists():
+            if not stat.S_ISSOCK(path.lstat().st_mode):
+                raise ValueError(f"control socket {path}: there is something else")
+            if _answers(path):
+                raise ValueError(f"control socket {path}: another program listens there")
+            path.unlink(missing_ok=True)
+        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        before = os.umask(0o177)
+        try:
+            server.bind(str(path))
+        except OSError as error:
+            server.close()
+            raise ValueError(f"control socket {path}: {error}") from None
+        finally:
+            os.umask(before)
+        server.listen(CLIENTS)
+        server.setblocking(False)
+        return server
 
     def _listen(self) -> None:
         clients: list[_Client] = []  # the first to have come is the first to run out of time
@@ -254,7 +269,8 @@ def tell(path: Path, command: str) -> dict[str, Any]:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(2.0 * PATIENCE)
             _connect(client, path, 2.0 * PATIENCE)
-            client.sendall(command.strip().encode() + b"\n")
+            with suppress(BrokenPipeError):  # it has hung up, and said why
+                client.sendall(command.strip().encode() + b"\n")
             with client.makefile("rb") as answer:
                 return json.loads(answer.readline())
     except (OSError, json.JSONDecodeError) as error:
@@ -274,7 +290,7 @@ def _connect(client: socket.socket, path: Path, patience: float) -> None:
 
 
 def _answers(path: Path) -> bool:
-    """Whether a loop that lives may listen there: one that is busy does, and only one that is gone refuses."""
+    """Whether somebody who lives may listen there: who is busy does, and only who is gone refuses."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(PATIENCE)
@@ -284,3 +300,28 @@ def _answers(path: Path) -> bool:
     except OSError:
         pass
     return True
+
+
+class _Lock:
+    """That one loop alone listens at a path: a lock on a file beside it, which ends with the process that has it."""
+
+    def __init__(self, path: Path) -> None:
+        """ValueError if another process has it."""
+        self._path = path.with_name(path.name + ".lock")
+        while True:
+            try:
+                self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            except OSError as error:
+                raise ValueError(f"control socket {path}: {error}") from None
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(self._file)
+                raise ValueError(f"control socket {path}: another loop listens there") from None
+            if self._path.exists() and os.path.samestat(os.fstat(self._file), self._path.stat()):
+                return
+            os.close(self._file)  # whoever had it has removed it meanwhile
+
+    def release(self) -> None:
+        self._path.unlink(missing_ok=True)
+        os.close(self._file)

@@ -291,9 +291,9 @@ def test_a_loop_that_is_too_busy_to_be_connected_to_keeps_its_socket(tmp_path):
                 waiting.append(socket.socket(socket.AF_UNIX))
                 waiting[-1].setblocking(False)
                 waiting[-1].connect(str(path))
-        with pytest.raises(ValueError, match="another loop listens there"):
+        with pytest.raises(ValueError, match="another program listens there"):
             ControlServer(driver_of(), path)
-        assert path.exists()
+        assert [file.name for file in tmp_path.iterdir()] == ["busy.sock"]
     for client in waiting:
         client.close()
     with ControlServer(driver_of(), path):  # nobody is left
@@ -305,6 +305,34 @@ def test_only_this_user_may_connect_and_two_loops_do_not_share_a_socket(serving)
     assert path.stat().st_mode & 0o777 == 0o600
     with pytest.raises(ValueError, match="another loop listens there"):
         ControlServer(driver, path)
+
+
+def test_a_socket_that_somebody_removed_is_still_taken(tmp_path):
+    path = tmp_path / "loop.sock"
+    with ControlServer(driver_of(), path):
+        path.unlink()
+        with pytest.raises(ValueError, match="another loop listens there"):
+            ControlServer(driver_of(), path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_dead_loop_left_is_replaced_and_nothing_is_left_at_the_end(tmp_path):
+    path = tmp_path / "loop.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    path.with_name("loop.sock.lock").touch()
+    with ControlServer(driver_of(), path):
+        assert "error" not in tell(path, "status")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("target", ["absent", "file"])
+def test_a_link_or_a_file_in_the_place_of_the_socket_is_left_alone(tmp_path, target):
+    path = tmp_path / "loop.sock"
+    path.symlink_to(tmp_path / "absent") if target == "absent" else path.touch()
+    with pytest.raises(ValueError, match="there is something else"):
+        ControlServer(driver_of(), path)
+    assert [file.name for file in tmp_path.iterdir()] == ["loop.sock"]
 
 
 def test_where_nothing_listens_that_is_said(tmp_path):
