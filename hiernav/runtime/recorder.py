@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +48,13 @@ class Recorder(Observer):
             about: what is run, kept as the file's metadata.
 
         Raises:
-            OSError: the file exists or cannot be written.
+            OSError: the file exists or cannot be written; then none is left behind.
         """
         self.path = Path(path)
         if self.path.is_file():
             raise FileExistsError(f"{self.path}: the recording exists already; choose another name")
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        new = not self.path.exists()
         self._file = self.path.open("wb")
         self.ticks = self.dropped = 0
         """Ticks written, and records that found the queue full or could not be encoded."""
@@ -64,10 +66,17 @@ class Recorder(Observer):
         self._writer = Writer(self._file)
         self._indices = _ChunkIndices(self.path.parent)
         setattr(self._writer, _CHUNK_INDICES, self._indices)
-        self._writer.start(profile=PROFILE, library="hiernav")
-        self._writer.add_metadata(ABOUT, dict(about or {}))
-        self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}
-        self._file.flush()
+        try:
+            self._writer.start(profile=PROFILE, library="hiernav")
+            self._writer.add_metadata(ABOUT, dict(about or {}))
+            self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}
+            self._file.flush()
+        except OSError as error:
+            with suppress(OSError):  # what was not written still is not
+                self._file.close()
+            if new:
+                self.path.unlink(missing_ok=True)
+            raise OSError(f"{self.path}: the recording cannot be written: {error.strerror}") from None
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 

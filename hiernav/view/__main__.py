@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http
+import logging
 import os
 import re
 import select
@@ -27,6 +28,7 @@ OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d+)?")
 def main(descriptor: int) -> None:
     """Serve the page until the loop goes away."""
     _refuse_other_sites()
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # whoever knocks and says nothing is no news
     from hiernav.view.page import Page
 
     with socket.socket(fileno=descriptor) as link:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import errno
 import gc
 import json
 import math
 import threading
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +31,20 @@ def recorded(tmp_path_factory):
     writer.close()
     assert result.steps > 20 and writer.error is None and writer.dropped == 0
     return memory, path
+
+
+@pytest.mark.parametrize("how", ["nothing there", "a device"])
+def test_a_recording_that_cannot_begin_says_which_and_spends_no_name(tmp_path, monkeypatch, how):
+    path = tmp_path / "run.mcap" if how == "nothing there" else Path("/dev/full")
+    if how == "nothing there":
+
+        def full(*_: object, **__: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(recorder.Writer, "start", full)
+    with pytest.raises(OSError, match=f"{path}: the recording cannot be written: No space left on device"):
+        Recorder(path)
+    assert path.exists() == (how == "a device")
 
 
 def test_what_was_told_is_what_is_read_bit_for_bit(recorded):
