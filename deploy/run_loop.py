@@ -56,6 +56,7 @@ from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import noting_signals, stop_signals
 from hiernav.runtime.noise import EXACT
 from hiernav.runtime.observe import Event, Observer, TickRecord
+from hiernav.runtime.patient import be_patient, hurry
 from hiernav.runtime.pilot import Pilot
 from hiernav.runtime.policy import make_agent, require_fit
 from hiernav.runtime.process_planner import ProcessPlanner
@@ -130,6 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _require_place(arguments)
         return _dry_run(arguments) if arguments.dry_run else _run(arguments)
     except KeyboardInterrupt:  # before the robot moves or after it stands: there is nothing to brake
+        hurry()
         _complain("interrupted")
         return OK
     except BundleError as error:
@@ -279,21 +281,25 @@ def _run(arguments: argparse.Namespace) -> int:
     goal = _given_goal(arguments)
     settings = _settings(arguments, spec)
     bundle = _open_bundle(arguments.bundle or BUNDLES / spec.name, spec)
-    with ExitStack() as stack:
-        # both start while the rest is made ready
-        remote = None if arguments.fast else _process_robot(arguments, spec, settings, stack)
+    stack, remote, link = ExitStack(), None, None
+    try:
+        if not arguments.fast:  # it starts, and then the planner, while the rest is made ready
+            remote = _process_robot(arguments, spec, settings, stack)
         start_known = not arguments.adapter
         layouts = [_layout(world, arguments.seed + k, spec, goal, start_known) for k in range(arguments.episodes)]
-        link = None
         if not arguments.fast and arguments.planner != "sync":
             pixels, driver = layouts[0].occupancy(0.0).occupied.size, settings.driver
             link = ProcessPlanner(bundle, driver.robot_radius, pixels, goal_radius=driver.goal_radius)
             stack.callback(link.close)
         episodes = Episodes(arguments, layouts, spec, settings, bundle, remote, link)
         code = episodes.serve() if arguments.serve or view else episodes.drive()
-        with noting_signals(lambda: None):
+    finally:
+        with noting_signals(lambda: None):  # however often an end is asked for: no process is left behind
             stack.close()
-        return code
+    if remote is not None and remote.killed:
+        _complain("the robot's adapter did not end, and was killed: nothing here has braked the robot since")
+        return code or FAULT
+    return code
 
 
 class Episodes:
@@ -340,7 +346,7 @@ class Episodes:
             rehearsal=0.0 if arguments.fast else settings.realtime.rehearsal,
         )
         # before anything moves: after the drive it would be too late
-        self.out = arguments.out or Path("runs") / f"drive-{time.strftime('%Y%m%d-%H%M%S')}"
+        self.out = arguments.out or _new_folder(Path("runs"), f"drive-{time.strftime('%Y%m%d-%H%M%S')}")
         self.files = [self.out / "summary.json"]
         _require_writable(self.files[0], "--out")
         if arguments.json not in (None, "-"):
@@ -421,9 +427,13 @@ class Episodes:
                     self.account.add_fault(f"{type(error).__name__}: {error}", self.driver.clock.now())
                     _show(traceback.print_exc, sys.stderr)
                 finally:
-                    for observer in filter(None, (self.recorder, self.page)):
-                        observer.close()
-                code = self._finish(drives)
+                    if self.recorder is not None:
+                        self.recorder.close()
+                try:
+                    code = self._finish(drives)
+                finally:
+                    if self.page is not None:
+                        self.page.close()
             if not (self.arguments.no_pictures or self.interrupted):
                 self._draw(drives)
         except KeyboardInterrupt:
@@ -431,6 +441,7 @@ class Episodes:
         return code
 
     def _interrupt(self) -> None:
+        hurry()
         self.interrupted = True
         self.driver.quit()
 
@@ -456,21 +467,23 @@ class Episodes:
         return bool(self.faults.open) or self.driver.supervisor.mode is Mode.FAULT
 
     def _finish(self, drives: Sequence[Drive]) -> int:
-        """Show and save the account of the run; what cannot be saved is a warning, and changes no exit code."""
+        """Save and show the account of the run; what cannot be saved is a warning, and changes no exit code."""
         code = OK
         if not self.serves and any(episode.result.refused for episode in self.account.episodes):
             code = BAD_GOAL  # who serves was asked for many goals, and told of each
         if self._at_fault():
             code = FAULT
+        if self.driver.interrupted:
+            hurry()
         summary = self._summary(drives)
+        for file in self.files:  # before it is shown, where a terminal may be stalled
+            _save(file, summary)
         _show(lambda: print_summary(summary, self.console), self.console.file)
         if self.recorder is not None:
             self._print(f"recording: {self.recorder}")
         self._print(f"run folder: {self.out}")
         if self.arguments.json == "-":
             _show(lambda: print(json.dumps(summary, indent=2), flush=True), sys.stdout)
-        for file in self.files:
-            _save(file, summary)
         return code
 
     def _print(self, text: str) -> None:
@@ -527,6 +540,18 @@ def _show(show: Callable[[], object], stream: IO[str]) -> None:
 
 def _complain(text: str) -> None:
     _show(lambda: print(f"run_loop: {text}", file=sys.stderr, flush=True), sys.stderr)
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    """Make a folder that no other run has: two may begin in the same second."""
+    parent.mkdir(parents=True, exist_ok=True)
+    number = 1
+    while True:
+        folder = parent / (name if number == 1 else f"{name}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+        number += 1
 
 
 def _require_writable(file: Path, option: str) -> None:
@@ -637,4 +662,8 @@ def _given_goal(arguments: argparse.Namespace) -> np.ndarray | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    be_patient()
+    status = main()
+    for number in stop_signals():  # all that was to be done is done
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)

@@ -9,7 +9,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -73,6 +75,42 @@ def refused(script: ModuleType, capsys: pytest.CaptureFixture[str], tmp_path: Pa
         return line
 
     return run
+
+
+def test_a_simulated_robot_passes_the_dry_run(script, capsys):
+    assert script.main(["--dry-run", "--bundle", str(SCRIPT.parent / "bundles" / "point")]) == 0
+    assert "error" not in capsys.readouterr().out
+
+
+def test_two_runs_of_the_same_second_have_folders_of_their_own(script, tmp_path):
+    folders = [script._new_folder(tmp_path / "runs", "drive-now") for _ in range(3)]
+    assert [folder.name for folder in folders] == ["drive-now", "drive-now-2", "drive-now-3"]
+    assert all(folder.is_dir() for folder in folders)
+
+
+def test_a_reader_that_has_stopped_holds_up_neither_the_end_nor_the_summary(tmp_path):
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    arguments = ["--fast", "--no-pictures", "--bundle", SCRIPT.parent / "bundles" / "point", "--out", tmp_path / "out"]
+    run = subprocess.Popen(command(*arguments), stdout=writer, stderr=writer, cwd=tmp_path)
+    try:
+        end = time.monotonic() + 60.0
+        while not (tmp_path / "out").exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        while run.poll() is None and time.monotonic() < end:
+            run.send_signal(signal.SIGTERM)
+            time.sleep(0.2)
+        assert run.poll() == 0
+    finally:
+        run.kill()
+        run.wait()
+        for end_of_pipe in (reader, writer):
+            os.close(end_of_pipe)
+    assert (tmp_path / "out" / "summary.json").exists()
 
 
 def summary_of(drive: tuple[Path, str]) -> dict[str, Any]:

@@ -216,6 +216,7 @@ class Remote(SimRobot):
 
     watchdog_trips = 0
     realtime: dict[str, str] = {}
+    killed = False
 
 
 @pytest.fixture

@@ -1,0 +1,78 @@
+"""Printing that is not held up for good by a terminal that was stopped, or by a pipe that nobody reads."""
+
+from __future__ import annotations
+
+import io
+import os
+import select
+import sys
+import time
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+PATIENCE = 1.0
+"""Time that a reader is given to take something [s]."""
+_PART = 512
+"""Bytes that fit wherever there is room at all."""
+
+
+class PatientWriter(io.RawIOBase):
+    """Writes to a descriptor whose reader may have stopped.
+
+    What it does not take within `PATIENCE` is lost, and what follows too, until it takes something again. With
+    `faithful` it is waited for without end, up to `hurry`.
+    """
+
+    hurried = False
+
+    def __init__(self, descriptor: int, faithful: bool) -> None:
+        self._descriptor, self._faithful = descriptor, faithful
+        self._deaf = False
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: ReadableBuffer) -> int:
+        """All of it, or what the reader takes of it; OSError where there is no reader any more."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        while rest and self._has_room():
+            rest = rest[os.write(self._descriptor, rest[:_PART]) :]
+        return size
+
+    def _has_room(self) -> bool:
+        began = None
+        while not select.select([], [self._descriptor], [], 0.0 if self._deaf else 0.05)[1]:
+            if self._deaf:
+                return False
+            if not self._faithful or PatientWriter.hurried:
+                began = began or time.monotonic()
+                self._deaf = time.monotonic() - began > PATIENCE
+        self._deaf = False
+        return True
+
+
+def be_patient() -> None:
+    """Have this process print so: what is reported waits for its reader, what is complained about does not."""
+    sys.stdout, sys.stderr = _patient(sys.stdout, True), _patient(sys.stderr, False)
+
+
+def hurry() -> None:
+    """The end was asked for: wait for no reader any more."""
+    PatientWriter.hurried = True
+
+
+def _patient(stream: TextIO, faithful: bool) -> TextIO:
+    if not isinstance(stream, io.TextIOWrapper):  # it was closed before this process began
+        return stream
+    stream.flush()
+    raw = io.BufferedWriter(PatientWriter(stream.fileno(), faithful))
+    return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=stream.line_buffering)
