@@ -209,7 +209,7 @@ def png_header(width: int, height: int) -> bytes:
         (b"P2 2 2 255\n", "0 pixels"),
         (b"P2 2 2 255\n1 2 3 x", "not a whole number"),
         (b"P2 2 2 255\n1 2 3 256", "pixel values 1 to 256"),
-        (b"P2 2 2 255\n1 2 3 -1", "pixel values -1 to 3"),
+        (b"P2 2 2 255\n1 2 3 -1", "not a whole number"),
         (b"P5 2", "neither a PNG nor a PGM"),
         (b"P6 1 1 255\nabc", "neither a PNG nor a PGM"),
         (b"", "neither a PNG nor a PGM"),
