@@ -36,8 +36,6 @@ class OnnxFacts:
 
     opset: int
     """Version of the standard operators; 0 if none is imported."""
-    nodes: int
-    """Number of operators in all graphs."""
     custom_operators: tuple[str, ...]
     """Operators from outside of the standard, as domain.name."""
     external_data: bool
@@ -54,13 +52,12 @@ def inspect_onnx(data: bytes) -> OnnxFacts:
     walk.message("Model", memoryview(data), 0)
     if not walk.graphs:
         raise OnnxFileError("no graph in it")
-    return OnnxFacts(walk.opset, walk.nodes, tuple(sorted(walk.custom)), walk.external)
+    return OnnxFacts(walk.opset, tuple(sorted(walk.custom)), walk.external)
 
 
 class _Walk:
     def __init__(self) -> None:
         self.opset = 0
-        self.nodes = 0
         self.graphs = 0
         self.custom: set[str] = set()
         self.external = False
@@ -90,7 +87,6 @@ class _Walk:
         if kind == "Graph":
             self.graphs += 1
         elif kind == "Node":
-            self.nodes += 1
             domain = texts.get(_NODE_DOMAIN, "")
             if domain not in _STANDARD_DOMAINS:
                 self.custom.add(f"{domain}.{texts.get(_NODE_OPERATOR, '?')}")
