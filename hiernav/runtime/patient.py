@@ -7,10 +7,7 @@ import os
 import select
 import sys
 import time
-from typing import TYPE_CHECKING, TextIO
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
+from typing import Any, TextIO
 
 PATIENCE = 1.0
 """Time that a reader is given to take something [s]."""
@@ -40,7 +37,7 @@ class PatientWriter(io.RawIOBase):
     def writable(self) -> bool:
         return True
 
-    def write(self, data: ReadableBuffer) -> int:
+    def write(self, data: Any) -> int:
         """All of it, or what the reader takes of it; OSError where there is no reader any more."""
         rest = memoryview(data).cast("B")
         size = len(rest)
