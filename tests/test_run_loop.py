@@ -21,7 +21,12 @@ import pytest
 import tiny_run
 from without_torch import BLOCK
 
+from hiernav.drive import main as drive_main
+from hiernav.drive.arguments import make_parser, settings_of
+from hiernav.drive.exits import FAULT
+from hiernav.drive.screen import new_folder
 from hiernav.sim.layout import parse_world
+from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
 
 SCRIPT = Path(__file__).parents[1] / "deploy" / "run_loop.py"
@@ -83,7 +88,7 @@ def test_a_simulated_robot_passes_the_dry_run(script, capsys):
 
 
 def test_two_runs_of_the_same_second_have_folders_of_their_own(script, tmp_path):
-    folders = [script._new_folder(tmp_path / "runs", "drive-now") for _ in range(3)]
+    folders = [new_folder(tmp_path / "runs", "drive-now") for _ in range(3)]
     assert [folder.name for folder in folders] == ["drive-now", "drive-now-2", "drive-now-3"]
     assert all(folder.is_dir() for folder in folders)
 
@@ -276,7 +281,7 @@ def test_an_adapter_of_another_rate_is_refused_before_it_is_driven(script, able_
     ],
 )
 def test_a_real_robot_is_driven_nowhere_that_nobody_named(script, tmp_path, capsys, monkeypatch, arguments, missing):
-    monkeypatch.setattr(script, "_run", lambda _: pytest.fail("it was begun"))
+    monkeypatch.setattr(drive_main, "_run", lambda _: pytest.fail("it was begun"))
     assert script.main(["--adapter", "my_robot.py:make", *arguments, "--out", str(tmp_path)]) == 2
     assert f"--adapter moves a real robot: name {'the map' if missing == '--world' else 'its --goal'}" in (
         capsys.readouterr().err
@@ -286,12 +291,12 @@ def test_a_real_robot_is_driven_nowhere_that_nobody_named(script, tmp_path, caps
 def test_settings_that_are_accepted_are_obeyed(script, able_bundle, tmp_path):
     made: list[object] = []
 
-    class Watched(script.Episodes):
+    class Watched(drive_main.Episodes):
         def drive(self) -> int:
             made.append(self.driver)
             return super().drive()
 
-    script.Episodes, before = Watched, script.Episodes
+    drive_main.Episodes, before = Watched, drive_main.Episodes
     try:
         asked = {"driver.goal_radius": 0.2, "driver.max_steps": 7, "driver.robot_radius": 0.12, "guard.slew_limit": 0.3}
         settings = [text for key, value in asked.items() for text in ("--set", f"{key}={value}")]
@@ -299,7 +304,7 @@ def test_settings_that_are_accepted_are_obeyed(script, able_bundle, tmp_path):
         arguments = ["--fast", "--bundle", str(able_bundle), "--no-pictures", "--out", str(out), *settings]
         script.main(arguments)
     finally:
-        script.Episodes = before
+        drive_main.Episodes = before
     driver = made[0]
     option = driver.pilot.agent.option
     assert (driver.config.goal_radius, option.goal_radius) == (0.2, 0.2)
@@ -345,27 +350,24 @@ def test_ctrl_c_brakes_and_still_writes_the_summary(able_bundle, tmp_path):
     ],
 )
 def test_what_a_loop_answers_is_printed_and_decides_the_exit_code(script, monkeypatch, capsys, answer, code):
-    monkeypatch.setattr(script, "tell", lambda path, line: answer)
+    monkeypatch.setattr(drive_main, "tell", lambda path, line: answer)
     assert script.main(["--tell", "goal 50,50"]) == code
     assert json.loads(capsys.readouterr().out) == answer
 
 
-def test_a_file_of_settings_takes_nothing_away_from_the_robot_s_own(script, tmp_path):
+def test_a_file_of_settings_takes_nothing_away_from_the_robot_s_own(tmp_path):
     own = tmp_path / "own.yaml"
     own.write_text("estimator: {gyro_sigma: 0.05}\n")
-    arguments = script._parser().parse_args(["--robot", "doggo", "--world", "gremlin", "--settings", str(own)])
-    settings = script._settings(arguments, script.get_robot("doggo"))
+    asked = ["--robot", "doggo", "--world", "gremlin", "--settings", str(own)]
+    settings = settings_of(make_parser("", SCRIPT.parent).parse_args(asked), get_robot("doggo"))
     assert settings.estimator.gyro_sigma == 0.05 and settings.guard.tilt_limit == 1.31
 
 
 @pytest.mark.parametrize(("robot", "limit"), [("doggo", 1.31), ("car", 1.31), ("point", None)])
-def test_a_robot_that_can_fall_has_a_limit_of_its_tilt_also_where_its_file_is_missing(
-    script, tmp_path, monkeypatch, robot, limit
-):
+def test_a_robot_that_can_fall_has_a_limit_of_its_tilt_also_where_its_file_is_missing(tmp_path, robot, limit):
     """The script may have been copied alone."""
-    monkeypatch.setattr(script, "__file__", str(tmp_path / "run_loop.py"))
     asked = ["--world", "gremlin", "--robot", robot, "--set", "guard.slew_limit=0.3"]
-    settings = script._settings(script._parser().parse_args(asked), script.get_robot(robot))
+    settings = settings_of(make_parser("", tmp_path).parse_args(asked), get_robot(robot))
     assert (settings.guard.tilt_limit, settings.guard.slew_limit) == (limit, 0.3)
 
 
@@ -379,7 +381,7 @@ def test_a_fault_ends_its_episode_and_not_the_run(script, doggo_bundle, tmp_path
     file = tmp_path / "out.json"
     arguments = ["--fast", "--robot", "doggo", "--bundle", str(doggo_bundle), "--episodes", "2", "--no-pictures"]
     arguments += ["--set", "guard.tilt_limit=0.001"]
-    assert script.main([*arguments, "--out", str(tmp_path / "run"), "--json", str(file)]) == script.FAULT
+    assert script.main([*arguments, "--out", str(tmp_path / "run"), "--json", str(file)]) == FAULT
     episodes = json.loads(file.read_text())["episodes"]
     assert [episode["reason"] for episode in episodes] == ["fault", "fault"]
     assert all("tilted" in episode["fault"] for episode in episodes)

@@ -37,8 +37,11 @@ class PlannerLink(DeferredPlanner, Protocol):
 
     stamp: float
     """Of the estimate that is asked with; written before every `plan` [s]."""
-    failed: str | None
-    """Why no answer is to be expected any more, or None."""
+
+    @property
+    def failed(self) -> str | None:
+        """Why no answer is to be expected any more, or None."""
+        ...
 
     def answer(self, now: float) -> Answer | None:
         """The newest answer not yet taken, at `now` on the loop's clock [s]. Called every tick."""

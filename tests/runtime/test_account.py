@@ -20,6 +20,8 @@ from rich.console import Console
 from run_loop_script import load_script
 from shipped import RUN_LOOP
 
+from hiernav.drive import episodes, exits, picture
+from hiernav.drive import main as drive_main
 from hiernav.runtime.account import KEPT, Account, Episode, FaultWatch
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver
@@ -80,7 +82,7 @@ def test_a_full_disk_at_the_end_costs_neither_table_nor_exit_code(run, tmp_path,
 
     (tmp_path / "x.json").write_text("of the last run")
     monkeypatch.setattr("os.replace", full)
-    monkeypatch.setattr(script.Drive, "draw", full)
+    monkeypatch.setattr(picture.Drive, "draw", full)
     assert run(*arguments, "--json", "x.json") == code
     shown = capsys.readouterr()
     assert "goals reached" in shown.out and "run folder: out" in shown.out
@@ -97,8 +99,8 @@ def test_ctrl_c_while_pictures_are_drawn_costs_pictures_alone(run, tmp_path, cap
         file.write_bytes(b"half a pic")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(script.Drive, "draw", interrupted)
-    assert run(*FAULTY) == script.FAULT
+    monkeypatch.setattr(picture.Drive, "draw", interrupted)
+    assert run(*FAULTY) == exits.FAULT
     assert "0 of 1 goals reached" in capsys.readouterr().out
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["summary.json"]
 
@@ -108,9 +110,9 @@ def driven(folder: Path) -> list[str]:
 
 
 def test_a_signal_between_two_worlds_costs_nothing_of_what_was_driven(run, tmp_path, monkeypatch):
-    tell = script.Episodes._say_ended
+    tell = episodes.Episodes._say_ended
     monkeypatch.setattr(
-        script.Episodes, "_say_ended", lambda *given: signal.raise_signal(signal.SIGTERM) or tell(*given)
+        episodes.Episodes, "_say_ended", lambda *given: signal.raise_signal(signal.SIGTERM) or tell(*given)
     )
     assert run(*SHORT, "--episodes", "3") == 0
     assert driven(tmp_path) == ["timeout"]
@@ -144,7 +146,7 @@ def test_a_world_that_cannot_be_entered_is_a_fault_and_costs_nothing_of_what_was
         reset(robot, layout, seed)
 
     monkeypatch.setattr(SimRobot, "reset", gone)
-    assert run(*SHORT, "--episodes", "5", "--no-pictures") == script.FAULT
+    assert run(*SHORT, "--episodes", "5", "--no-pictures") == exits.FAULT
     assert driven(tmp_path) == ["timeout", "timeout"] and begun[-1] == 2
     assert capsys.readouterr().err == "run_loop: the robot's adapter ended with status -9\n"
 
@@ -194,7 +196,7 @@ def test_a_screen_that_nobody_reads_costs_neither_worlds_nor_account_nor_exit_co
 @pytest.mark.parametrize("dry", [False, True])
 def test_a_dash_asks_for_json_alone_on_the_standard_output(run, tmp_path, capsys, monkeypatch, dry):
     if dry:
-        monkeypatch.setattr(script, "report", lambda *_: {"bundle": {"robot": "point"}})
+        monkeypatch.setattr(drive_main, "report", lambda *_: {"bundle": {"robot": "point"}})
     assert run(*(["--dry-run"] if dry else [*SHORT, "--no-pictures"]), "--json", "-") == 0
     shown = capsys.readouterr()
     found = json.loads(shown.out)
@@ -242,9 +244,11 @@ def serve(run, tmp_path, monkeypatch) -> Callable[..., tuple[int, dict[str, Any]
         return code, json.loads((tmp_path / "out/summary.json").read_text())
 
     layout = sample_layout(parse_world("pillar(2,2,0)"), 0)
-    monkeypatch.setattr(script, "_process_robot", lambda _, spec, settings, __: Remote(spec, layout, settings.noise))
-    monkeypatch.setattr(script, "MonotonicClock", FakeClock)
-    monkeypatch.setattr(script, "request_realtime", lambda _: {})
+    monkeypatch.setattr(
+        drive_main, "_process_robot", lambda _, spec, settings, __: Remote(spec, layout, settings.noise)
+    )
+    monkeypatch.setattr(episodes, "MonotonicClock", FakeClock)
+    monkeypatch.setattr(episodes, "request_realtime", lambda _: {})
     return served
 
 
@@ -351,7 +355,7 @@ def test_a_loop_that_listens_already_or_a_page_that_fails_spends_no_recording_s_
     def fails(*_: object) -> None:
         raise ValueError("the live page does not come up")
 
-    monkeypatch.setattr(script, "_open_page", fails)
+    monkeypatch.setattr(episodes, "_open_page", fails)
     assert run(*SERVE, "--view", "--record", "a.mcap") == 2
     assert not (tmp_path / "a.mcap").exists() and not (tmp_path / "socket").exists()
     (tmp_path / "a.mcap").write_text("of the last run")
@@ -367,7 +371,7 @@ def test_an_error_out_of_the_loop_is_a_fault_and_costs_nothing_of_what_was_drive
         return drive(driver, goal) if len(goals) == 1 else 1 / 0
 
     monkeypatch.setattr(Driver, "run", fails)
-    assert run(*SHORT, "--episodes", "3", "--no-pictures", "--record", "a.mcap") == script.FAULT
+    assert run(*SHORT, "--episodes", "3", "--no-pictures", "--record", "a.mcap") == exits.FAULT
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     assert [episode["reason"] for episode in summary["episodes"]] == ["timeout"] and len(goals) == 2
     assert [fault["why"] for fault in summary["faults"]["newest"]] == ["ZeroDivisionError: division by zero"]
