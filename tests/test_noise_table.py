@@ -91,7 +91,7 @@ def test_what_was_driven_is_not_driven_again_and_not_mixed_with_another_bundles(
         "reached": True, "reason": "goal", "fault": None, "steps": 90, "collisions": 0, "holds": 0, "recoveries": 0,
     }}} for case in tool.cases(factorial=False)}  # fmt: skip
     files = tool.load_bundle(BUNDLE).manifest.files
-    settings = json.loads(json.dumps(asdict(tool.robot_settings(get_robot("point")))))
+    settings = json.loads(json.dumps(asdict(tool.robot_settings(get_robot("point"), tool.DEPLOY))))
     settings.pop("realtime")
     about = {"robot": "point", "bundle": files, "world": "pillar(2,2,10)", "told": True, "settings": settings}
     out.write_text(json.dumps({"about": about, "cases": done}))

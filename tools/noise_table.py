@@ -36,6 +36,7 @@ sys.path.insert(0, str(ROOT))
 
 from bad_input import exit_code, whole  # noqa: E402
 
+from hiernav.drive.arguments import robot_settings  # noqa: E402
 from hiernav.files import write_json  # noqa: E402
 from hiernav.nav.bundle import Bundle, load_bundle  # noqa: E402
 from hiernav.nav.goal import GOAL_RADIUS  # noqa: E402
@@ -49,12 +50,13 @@ from hiernav.runtime.noise import EXACT  # noqa: E402
 from hiernav.runtime.pilot import Pilot  # noqa: E402
 from hiernav.runtime.policy import load_networks, make_agent, make_planner  # noqa: E402
 from hiernav.runtime.robot import SensorFrame  # noqa: E402
-from hiernav.runtime.settings import Settings, load_settings  # noqa: E402
 from hiernav.runtime.sim_robot import SimRobot  # noqa: E402
 from hiernav.sim.layout import parse_world  # noqa: E402
-from hiernav.sim.robots import RobotSpec, get_robot  # noqa: E402
+from hiernav.sim.robots import get_robot  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
 
+DEPLOY = ROOT / "deploy"
+"""Where the robots' settings are."""
 CHUNK = 5
 """Worlds driven between two writes of the results."""
 
@@ -125,21 +127,11 @@ def _bundle(path: str) -> Bundle:
     return load_bundle(path)
 
 
-def robot_settings(spec: RobotSpec) -> Settings:
-    """Those that deploy/run_loop.py drives the robot with."""
-    file = ROOT / "deploy" / f"{spec.name}.yaml"
-    asked = {
-        "estimator": {"tilts": spec.free_base},
-        "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS},
-    }
-    return load_settings([file] if file.exists() else [], defaults=asked)
-
-
 def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> dict[str, dict[str, Any]]:
     """Outcome by seed of one case in some worlds."""
     bundle = _bundle(path)
     spec = get_robot(bundle.manifest.robot)
-    settings = robot_settings(spec)
+    settings = robot_settings(spec, DEPLOY)
     layouts = [sample_layout(parse_world(world), seed, spec.radius) for seed in seeds]
     plain = EXACT if case == NOISE_FREE else settings.noise
     sigmas = ("accelerometer", "gyro", "magnetometer", "velocimeter", "lidar", "extra", "fix")
@@ -214,7 +206,7 @@ def main() -> int:
     bundle = load_bundle(arguments.bundle)
     robot = bundle.manifest.robot
     arguments.out = arguments.out or Path("runs") / f"noise_table-{robot}.json"
-    settings = asdict(robot_settings(get_robot(robot)))
+    settings = asdict(robot_settings(get_robot(robot), DEPLOY))
     about = {
         "robot": robot,
         "bundle": bundle.manifest.files,

@@ -88,23 +88,35 @@ def require_place(arguments: argparse.Namespace) -> None:
 
 
 def settings_of(arguments: argparse.Namespace, spec: RobotSpec) -> Settings:
-    """Those of the robot's file in `home`, with what a file that is named says over them.
+    """`robot_settings` with what the command line says."""
+    files = () if arguments.settings is None else (arguments.settings,)
+    steps = parse_world(arguments.world).max_steps
+    settings = robot_settings(spec, arguments.home, files, arguments.set, max_steps=steps)
+    return replace(settings, noise=EXACT) if arguments.exact else settings
+
+
+def robot_settings(
+    spec: RobotSpec, home: Path, files: Sequence[Path] = (), overrides: Sequence[str] = (), **driver: Any
+) -> Settings:
+    """What a robot is driven with.
+
+    Args:
+        spec: of the robot.
+        home: folder with a file of its own settings, if there is one.
+        files: whose settings go over those.
+        overrides: KEY=VALUE, which go over all files.
+        driver: of its settings, those that differ from the defaults where no file says anything.
 
     Raises:
         ConfigError: they are wrong, or leave a robot that can fall without a limit of its tilt.
     """
-    own = arguments.home / f"{spec.name}.yaml"
-    paths = [path for path in (own if own.exists() else None, arguments.settings) if path is not None]
+    own = home / f"{spec.name}.yaml"
     asked: dict[str, dict[str, Any]] = {
         "estimator": {"tilts": spec.free_base},
-        "driver": {
-            "robot_radius": spec.radius,
-            "goal_radius": GOAL_RADIUS,
-            "max_steps": parse_world(arguments.world).max_steps,
-        },
+        "driver": {"robot_radius": spec.radius, "goal_radius": GOAL_RADIUS, **driver},
         "guard": {"tilt_limit": TILT_LIMIT} if spec.free_base else {},
     }
-    settings = load_settings(paths, arguments.set, asked)
+    settings = load_settings([*([own] if own.exists() else []), *files], overrides, asked)
     if spec.free_base and settings.guard.tilt_limit is None:
         raise ConfigError(f"guard.tilt_limit is null: a {spec.name} can fall, which must be a fault; set it in rad")
-    return replace(settings, noise=EXACT) if arguments.exact else settings
+    return settings
