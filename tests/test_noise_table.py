@@ -12,7 +12,6 @@ import pytest
 
 from hiernav.nav.bundle import load_bundle
 from hiernav.runtime.guard import Guard, GuardConfig
-from hiernav.runtime.settings import load_settings
 from hiernav.sim.robots import get_robot
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +60,8 @@ def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatc
     monkeypatch.setattr(tool, "Driver", driver)
     with pytest.raises(Stop):
         tool.drive(tool.Case(), str(BUNDLES / robot), "gremlin", [0], told=True)
-    shipped = load_settings([ROOT / "deploy" / f"{robot}.yaml"]).guard
+    shipped = tool.robot_settings(get_robot(robot), ROOT / "deploy").guard
+    assert (shipped.tilt_limit is None) == (robot == "point")
     bundle = load_bundle(BUNDLES / robot)
     (guard,) = (each for each in driven if isinstance(each, Guard))
     assert guard.config == replace(shipped, slew_limit=bundle.manifest.guard.slew_limit)
