@@ -24,11 +24,12 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from hiernav.drive import main as run
 from hiernav.runtime.loop import stop_signals
-from hiernav.runtime.patient import be_patient
+from hiernav.runtime.patient import be_patient, hurry
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,5 +41,10 @@ if __name__ == "__main__":
     be_patient()
     status = main()
     for number in stop_signals():  # all that was to be done is done
+        signal.signal(number, lambda *_: hurry())
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        with suppress(OSError):
+            stream.flush()
+    for number in stop_signals():
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)

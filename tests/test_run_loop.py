@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -25,6 +26,7 @@ from hiernav.drive import main as drive_main
 from hiernav.drive.arguments import make_parser, settings_of
 from hiernav.drive.exits import FAULT
 from hiernav.drive.screen import new_folder
+from hiernav.runtime import process_robot
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
@@ -87,35 +89,91 @@ def test_a_simulated_robot_passes_the_dry_run(script, capsys):
     assert "error" not in capsys.readouterr().out
 
 
+def test_a_robot_that_does_not_end_fails_the_dry_run(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(process_robot, "CLOSING", 0.2)
+    adapter = tmp_path / "stuck.py"
+    example = str(SCRIPT.parent)
+    adapter.write_text(
+        f"import sys, time\nsys.path.insert(0, {example!r})\nimport example_robot\n"
+        "def make():\n    robot = example_robot.make()\n    robot.close = lambda: time.sleep(600.0)\n    return robot\n"
+    )
+    bundle = str(SCRIPT.parent / "bundles" / "point")
+    asked = ["--dry-run", "--bundle", bundle, "--adapter", f"{adapter}:make", "--json", "-"]
+    assert drive_main.main(asked, "", SCRIPT.parent) == FAULT
+    assert "did not end, and was killed" in json.loads(capsys.readouterr().out)["robot"]["error"]
+
+
 def test_two_runs_of_the_same_second_have_folders_of_their_own(script, tmp_path):
     folders = [new_folder(tmp_path / "runs", "drive-now") for _ in range(3)]
     assert [folder.name for folder in folders] == ["drive-now", "drive-now-2", "drive-now-3"]
     assert all(folder.is_dir() for folder in folders)
 
 
-def test_a_reader_that_has_stopped_holds_up_neither_the_end_nor_the_summary(tmp_path):
-    reader, writer = os.pipe()
+def stopped_pipe() -> tuple[int, int]:
+    """Ends to read and to write of a pipe that has no room."""
+    return full(*os.pipe())
+
+
+def stopped_terminal() -> tuple[int, int]:
+    """The same of a terminal that has room for a few bytes."""
+    reader, writer = os.openpty()
+    full(reader, writer)
+    os.read(reader, 100)
+    return reader, writer
+
+
+def full(reader: int, writer: int) -> tuple[int, int]:
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):
         while True:
-            os.write(writer, bytes(4096))
+            os.write(writer, b"x" * 512)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x")
     os.set_blocking(writer, True)
-    arguments = ["--fast", "--no-pictures", "--bundle", SCRIPT.parent / "bundles" / "point", "--out", tmp_path / "out"]
-    run = subprocess.Popen(command(*arguments), stdout=writer, stderr=writer, cwd=tmp_path)
+    return reader, writer
+
+
+def end(run: subprocess.Popen[bytes]) -> int:
+    """Ask for the end again and again; the exit code."""
+    deadline = time.monotonic() + 60.0
     try:
-        end = time.monotonic() + 60.0
-        while not (tmp_path / "out").exists() and time.monotonic() < end:
-            time.sleep(0.05)
-        while run.poll() is None and time.monotonic() < end:
+        while run.poll() is None and time.monotonic() < deadline:
             run.send_signal(signal.SIGTERM)
             time.sleep(0.2)
-        assert run.poll() == 0
+        assert run.poll() is not None, "it waits for its reader"
+        return run.returncode
     finally:
         run.kill()
         run.wait()
-        for end_of_pipe in (reader, writer):
-            os.close(end_of_pipe)
-    assert (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("stopped", [stopped_pipe, stopped_terminal])
+def test_a_reader_that_has_stopped_holds_up_neither_the_end_nor_the_summary(tmp_path, stopped):
+    reader, writer = stopped()
+    out, bundle = tmp_path / "out", SCRIPT.parent / "bundles" / "point"
+    run = subprocess.Popen(command("--fast", "--no-pictures", "--bundle", bundle, "--out", out), stdout=writer,
+                           stderr=writer, cwd=tmp_path)  # fmt: skip
+    while not out.exists() and run.poll() is None:
+        time.sleep(0.05)
+    assert end(run) == 0 and (out / "summary.json").exists()
+    os.close(reader)
+    os.close(writer)
+
+
+def test_the_end_of_a_command_without_a_loop_is_held_up_by_no_reader_either(tmp_path):
+    reader, writer = stopped_pipe()
+    with socket.socket(socket.AF_UNIX) as loop:
+        loop.bind(str(tmp_path / "socket"))
+        loop.listen()
+        run = subprocess.Popen(command("--tell", "status", "--control", tmp_path / "socket"), stdout=writer)
+        client, _ = loop.accept()
+        client.sendall(b'{"mode": "ready"}\n')
+        client.close()
+    time.sleep(0.5)
+    assert end(run) == 0
+    os.close(reader)
+    os.close(writer)
 
 
 def summary_of(drive: tuple[Path, str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ def add_configuration(parser: argparse.ArgumentParser, file_help: str) -> None:
 
 
 def worlds_of(arguments: argparse.Namespace) -> list[WorldSpec]:
-    """Those of `--world`, each once, in the order of their first mention, with a `--seed` that can decide them.
+    """Those of `--world`, each once, in the order of their first mention; `--seed` is checked too.
 
     Raises:
         ValueError: there is no such world, or the seed is negative.

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
+    """A bar for each task, on stderr, with its rate in the task's field `note`."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

@@ -28,6 +28,8 @@ from hiernav.runtime.settings import Settings
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import RobotSpec, get_robot
 
+KILLED = "the robot's adapter did not end, and was killed: nothing here has braked the robot since"
+
 
 def main(argv: Sequence[str] | None, description: str, home: Path) -> int:
     """Run a command line.
@@ -79,9 +81,16 @@ def _dry_run(arguments: argparse.Namespace) -> int:
     if arguments.json not in (None, "-"):
         require_writable(Path(arguments.json), "--json")
     layout_of(parse_world(arguments.world), arguments.seed, spec, given_goal(arguments), not arguments.adapter)
+    made: list[ProcessRobot] = []
     with ExitStack() as stack:
-        make = lambda: _process_robot(arguments, spec, settings, stack)  # noqa: E731
+
+        def make() -> ProcessRobot:
+            made.append(_process_robot(arguments, spec, settings, stack))
+            return made[0]
+
         found = report(lambda: open_bundle(bundle, spec), make, settings)
+    if made and made[0].killed:
+        found["robot"] = {**found["robot"], "error": "; ".join(filter(None, (found["robot"].get("error"), KILLED)))}
     print_report(found, screen(arguments))
     if arguments.json == "-":
         print(json.dumps(found, indent=2))
@@ -117,10 +126,10 @@ def _run(arguments: argparse.Namespace) -> int:
     finally:
         with noting_signals(lambda: None):  # however often an end is asked for: no process is left behind
             stack.close()
-    if remote is not None and remote.killed:
-        complain("the robot's adapter did not end, and was killed: nothing here has braked the robot since")
-        return code or FAULT
-    return code
+        killed = remote is not None and remote.killed
+        if killed:
+            complain(KILLED)
+    return code or (FAULT if killed else OK)
 
 
 def _process_robot(

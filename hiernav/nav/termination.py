@@ -1,4 +1,4 @@
-"""When an option ends: a rule without learned parts (paper section IV-C)."""
+"""Why options end, and the rule that tells it (paper section IV-C)."""
 
 from __future__ import annotations
 

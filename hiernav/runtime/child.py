@@ -44,6 +44,9 @@ class Child:
                 start_new_session=True,
                 env={**os.environ, **ONE_THREAD, **(environment or {}), "PYTHONPATH": path},
             )
+        except OSError:
+            os.close(self._news)
+            raise
         finally:
             os.close(news)
 

@@ -315,11 +315,13 @@ class _Lock:
                 raise ValueError(f"control socket {path}: {error}") from None
             try:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            except OSError as error:
                 os.close(self._file)
-                raise ValueError(f"control socket {path}: another loop listens there") from None
-            if self._path.exists() and os.path.samestat(os.fstat(self._file), self._path.stat()):
-                return
+                why = "another loop listens there" if isinstance(error, BlockingIOError) else str(error)
+                raise ValueError(f"control socket {path}: {why}") from None
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(self._file), self._path.stat()):
+                    return
             os.close(self._file)  # whoever had it has removed it meanwhile
 
     def release(self) -> None:

@@ -676,8 +676,10 @@ class Driver:
         )
 
     def _stop(self) -> bool | None:
-        """Brake until the measured speed shows that the robot stands; False if it does not in time, None if it cannot
-        be read."""
+        """Brake until the measured speed shows that the robot stands.
+
+        False if it does not in time, None if it cannot be read.
+        """
         watch = StopWatch(self.config.stop_speed, self.config.stop_turn, self.config.stop_timeout)
         watch.begin(self.clock.now())
         stopped: bool | None = None

@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import os
 import select
+import stat
 import sys
 import time
+from contextlib import suppress
 from typing import Any, TextIO
 
 PATIENCE = 1.0
 """Time that a reader is given to take something [s]."""
-_PART = 512
-"""Bytes that fit wherever there is room at all."""
 
 
 class PatientWriter(io.RawIOBase):
@@ -26,7 +26,8 @@ class PatientWriter(io.RawIOBase):
 
     def __init__(self, descriptor: int, faithful: bool) -> None:
         self._descriptor, self._faithful = descriptor, faithful
-        self._deaf = False
+        self._target = _without_blocking(descriptor)
+        self._deaf = self._gone = False
 
     def fileno(self) -> int:
         return self._descriptor
@@ -38,16 +39,22 @@ class PatientWriter(io.RawIOBase):
         return True
 
     def write(self, data: Any) -> int:
-        """All of it, or what the reader takes of it; OSError where there is no reader any more."""
+        """All of it, or what the reader takes of it; OSError, once, where there is no reader any more."""
         rest = memoryview(data).cast("B")
         size = len(rest)
-        while rest and self._has_room():
-            rest = rest[os.write(self._descriptor, rest[:_PART]) :]
+        while rest and not self._gone and self._has_room():
+            try:
+                rest = rest[os.write(self._target, rest) :]
+            except BlockingIOError:  # there is less room than it takes
+                time.sleep(0.01)
+            except OSError:
+                self._gone = True
+                raise
         return size
 
     def _has_room(self) -> bool:
         began = None
-        while not select.select([], [self._descriptor], [], 0.0 if self._deaf else 0.05)[1]:
+        while not select.select([], [self._target], [], 0.0 if self._deaf else 0.05)[1]:
             if self._deaf:
                 return False
             if not self._faithful or PatientWriter.hurried:
@@ -73,3 +80,15 @@ def _patient(stream: TextIO, faithful: bool) -> TextIO:
     stream.flush()
     raw = io.BufferedWriter(PatientWriter(stream.fileno(), faithful))
     return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=stream.line_buffering)
+
+
+def _without_blocking(descriptor: int) -> int:
+    """The same terminal or pipe, opened once more so that a write to it returns: others share the flags of the first.
+
+    The descriptor itself where that cannot be, and for files, which have a place to be written at.
+    """
+    kind = os.fstat(descriptor).st_mode
+    if stat.S_ISFIFO(kind) or stat.S_ISCHR(kind):
+        with suppress(OSError):
+            return os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+    return descriptor

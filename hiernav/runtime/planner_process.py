@@ -82,8 +82,14 @@ def _start(news: int, questions: int, memory: PlannerMemory) -> tuple[int, int]:
             code = 0
         finally:
             os._exit(code)
+    try:
+        watched = os.pidfd_open(pid)
+    except OSError:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        return 0, -1
     memory.set_status("pid", pid)
-    return pid, os.pidfd_open(pid)
+    return pid, watched
 
 
 def make_planner(memory: PlannerMemory) -> Planner:

@@ -105,7 +105,10 @@ class ProcessPlanner:
         if status.exhausted and status.starts > self._renewed_after:  # else the keeper is about to start another one
             return f"the planner's process failed again after {status.restarts} restarts"
         code = self._child.ended
-        return None if code is None else f"the planner's keeper ended with status {code}"
+        if code is None:
+            return None
+        self._child.close(family=True)  # a planner that cannot see the end of its keeper
+        return f"the planner's keeper ended with status {code}"
 
     def restart_count(self) -> int:
         return self.status.restarts
@@ -121,7 +124,7 @@ class ProcessPlanner:
             self._child.nudge(b"f")
             return
         self._child.close(family=True)
-        for field in ("restarts", "ready"):  # nobody else writes them now
+        for field in ("restarts", "ready", "exhausted"):  # nobody else writes them now
             self._memory.set_status(field, 0)
         with suppress(OSError):  # the system has no room for another process: it stays failed
             self._child = self._start_keeper()

@@ -199,7 +199,7 @@ class ProcessRobot:
     def _require_adapter(self) -> None:
         if self.child.ended is None:
             return
-        with suppress(OSError):  # what it said at last may have come meanwhile
+        with suppress(OSError, ValueError):  # what it said at last may have come meanwhile; not so after `close`
             while select.select([self._calls], [], [], 0.0)[0] and (part := self._calls.recv(65536)):
                 self._last_words += part
         raise RobotGone(f"the robot's adapter ended with status {self.child.ended}{_why(self._last_words)}")
@@ -223,7 +223,9 @@ class ProcessRobot:
                 self._require_adapter()
                 raise RobotGone("the robot's adapter does not answer any more")
             line += part
-        answer = json.loads(line.split(b"\n")[0])
+        said, _, rest = line.partition(b"\n")
+        self._last_words += rest
+        answer = json.loads(said)
         if "gone" in answer:  # it fails while it is asked for something
             self._last_words = line
             with suppress(subprocess.TimeoutExpired):

@@ -64,9 +64,9 @@ class Recorder(Observer):
         self._encoder = messages.TickEncoder()
         self._unreadable = False
         self._writer = Writer(self._file)
-        self._indices = _ChunkIndices(self.path.parent)
-        setattr(self._writer, _CHUNK_INDICES, self._indices)
         try:
+            self._indices = _ChunkIndices(self.path.parent)
+            setattr(self._writer, _CHUNK_INDICES, self._indices)
             self._writer.start(profile=PROFILE, library="hiernav")
             self._writer.add_metadata(ABOUT, dict(about or {}))
             self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}

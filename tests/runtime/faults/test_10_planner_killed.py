@@ -91,6 +91,8 @@ def test_a_keeper_that_was_killed_is_replaced_once_somebody_acknowledges():
     planner = ProcessPlanner(open_shipped("point"), 0.1, 6400)
     try:
         first, stopped = ask(planner), planner.status.pid
+        planner._memory.set_status("restarts", 3)
+        planner._memory.set_status("exhausted", 1)  # as after the third restart
         os.kill(stopped, signal.SIGSTOP)  # it cannot see that its keeper is gone
         planner._child.process.kill()
         planner._child.process.wait()
