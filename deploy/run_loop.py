@@ -29,7 +29,7 @@ from pathlib import Path
 
 from hiernav.drive import main as run
 from hiernav.runtime.loop import stop_signals
-from hiernav.runtime.patient import be_patient, hurry
+from hiernav.runtime.patient import PatientWriter, be_patient, hurry
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,9 +42,11 @@ if __name__ == "__main__":
     status = main()
     for number in stop_signals():  # all that was to be done is done
         signal.signal(number, lambda *_: hurry())
-    for stream in filter(None, (sys.stdout, sys.stderr)):
-        with suppress(OSError):
-            stream.flush()
+    with suppress(OSError):
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        if PatientWriter.lost:
+            print("run_loop: not all of the output was taken", file=sys.stderr, flush=True)
     for number in stop_signals():
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)

@@ -85,13 +85,9 @@ class Child:
         return ended
 
 
-def _stderr() -> int | None:
-    """Where a child prints, as this process's own output may be read by a program; None where there is no stderr."""
-    try:
-        os.fstat(2)
-    except OSError:
-        return None
-    return 2
+def _stderr() -> int:
+    """Where a child prints, as this process's own output may be read by a program; nowhere where there is no stderr."""
+    return subprocess.DEVNULL if sys.__stderr__ is None else 2  # whose number another file may have by now
 
 
 def leave_signals_to_parent() -> None:

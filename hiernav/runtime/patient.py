@@ -22,7 +22,8 @@ class PatientWriter(io.RawIOBase):
     `faithful` it is waited for without end, up to `hurry`.
     """
 
-    hurried = False
+    hurried = lost = False
+    """Whether the end was asked for, and whether anything was lost that should have been faithful."""
 
     def __init__(self, descriptor: int, faithful: bool) -> None:
         self._descriptor, self._faithful = descriptor, faithful
@@ -50,6 +51,7 @@ class PatientWriter(io.RawIOBase):
             except OSError:
                 self._gone = True
                 raise
+        PatientWriter.lost |= self._faithful and len(rest) > 0 and not self._gone
         return size
 
     def _has_room(self) -> bool:

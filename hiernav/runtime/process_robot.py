@@ -197,12 +197,15 @@ class ProcessRobot:
         return message
 
     def _require_adapter(self) -> None:
-        if self.child.ended is None:
-            return
-        with suppress(OSError, ValueError):  # what it said at last may have come meanwhile; not so after `close`
+        ended = self.child.ended
+        with suppress(OSError, ValueError):  # nothing is heard after `close`
             while select.select([self._calls], [], [], 0.0)[0] and (part := self._calls.recv(65536)):
                 self._last_words += part
-        raise RobotGone(f"the robot's adapter ended with status {self.child.ended}{_why(self._last_words)}")
+        why = _why(self._last_words)
+        if ended is not None:
+            raise RobotGone(f"the robot's adapter ended with status {ended}{why}")
+        if why:  # and then it ends, or is kept from it
+            raise RobotGone(f"the robot's adapter fails{why}")
 
     def _receive(self) -> dict[str, Any]:
         line, end = b"", time.monotonic() + self._patience

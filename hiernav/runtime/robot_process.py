@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
-import math
 import os
 import select
 import sys
@@ -45,6 +44,8 @@ LATE_LOOKS, LATE_WITHIN = 5, 2.0
 within so long [s]. Once may be the machine."""
 PARTS = ("control_period", "action_dim", "read", "send", "brake", "close")
 """What a robot has to have."""
+LONGEST = 1000
+"""Characters of an error that the control process is told."""
 LAST_BRAKES = 1.0
 """Time for which a robot is braked that failed, or of which nobody says that it stands, before it is released [s]."""
 
@@ -125,7 +126,8 @@ class Adapter:
         self._fix: tuple[np.ndarray, float] | None = None
         self._gathering = Gathering(self._period)
         self._braked = 0.0
-        self._looked = math.inf
+        self._kept = 0.0
+        """Time that `read` and `send` have taken since commands were looked for last [s]."""
         self._late: deque[tuple[float, float]] = deque(maxlen=LATE_LOOKS)
         self._introduced = False
 
@@ -142,11 +144,10 @@ class Adapter:
                 last_brakes = 0.0
         except BaseException as error:
             failures.append(error)
-            if self._introduced:
-                self._answer({"gone": _one_line(error)})
-            else:  # the control process still waits for that
-                self._answer({"error": f"the robot's adapter cannot start: {_one_line(error)}"})
-        failures += self._brake_for(last_brakes)
+        failures += self._brake_for(last_brakes)  # before anything else
+        if failures:  # one that was never introduced still owes its first answer
+            why = _one_line(failures[0])
+            self._answer({"gone": why} if self._introduced else {"error": f"the robot's adapter cannot start: {why}"})
         try:
             self.robot.close()
         except BaseException as error:
@@ -166,10 +167,8 @@ class Adapter:
         self._introduced = True
         while True:
             ready = select.select([self._news, self._calls], [], [], idle)[0]
-            if self._calls in ready:
-                if not self._take_call():
-                    return False
-                self._looked = math.inf  # nobody drives it meanwhile
+            if self._calls in ready and not self._take_call():
+                return False
             news = wait_for_news(self._news, 0.0) if self._news in ready else b""
             if news is None:
                 return False
@@ -205,7 +204,9 @@ class Adapter:
             if command is None or not fresh:
                 self.robot.brake()
             else:
+                began = time.monotonic()
                 self.robot.send(command)
+                self._kept += time.monotonic() - began
         elif self.watchdog.expired(now):
             # once, then at the control rate: a bus may need the brake repeated, but not hundreds of times a second
             trips = self.watchdog.trips
@@ -219,14 +220,16 @@ class Adapter:
 
     def _watch_pace(self, now: float) -> None:
         """Tell the control process of a robot whose `read` or `send` keeps its commands waiting again and again."""
-        if now - self._looked > self.watchdog.timeout:
-            self._late.append((now, now - self._looked))
-        self._looked = now
+        if self._kept > self.watchdog.timeout:
+            self._late.append((now, self._kept))
+        self._kept = 0.0
         often = len(self._late) == LATE_LOOKS and now - self._late[0][0] <= LATE_WITHIN
         self._status[SLOW] = max(gap for _, gap in self._late) if often else 0.0
 
     def _publish(self) -> None:
+        began = time.monotonic()
         frame = self.robot.read()
+        self._kept += time.monotonic() - began
         if not isinstance(frame, SensorFrame):
             raise TypeError(
                 f"read() returned {type(frame).__name__}, expected a SensorFrame; what is missing is None in it"
@@ -280,7 +283,10 @@ def _refusal(why: str) -> bytes:
 
 def _one_line(error: BaseException) -> str:
     """What is wrong, and the file and line that raised it where that is the robot's own code."""
-    text = " ".join(str(error).split())
+    try:
+        text = " ".join(str(error).split())[:LONGEST]
+    except Exception:
+        text = "it cannot even say what is wrong"
     if isinstance(error, AdapterError):
         return text
     frames = _frames(error)

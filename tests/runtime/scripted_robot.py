@@ -17,18 +17,25 @@ class ScriptedRobot:
     """Notes "send", "brake" and "close" with the monotonic time in a file, unbuffered.
 
     What `fails` names works `good` times, then raises `failures` times. The first `slow_reads` readings take `slow`
-    seconds each.
+    seconds each, and every brake `slow_brake`.
     """
 
     control_period = PERIOD
     action_dim = 2
 
     def __init__(
-        self, path: str, fails: str = "", good: int = 0, failures: int = 1, slow: float = 0.0, slow_reads: int = 1
+        self,
+        path: str,
+        fails: str = "",
+        good: int = 0,
+        failures: int = 1,
+        slow: float = 0.0,
+        slow_reads: int = 1,
+        slow_brake: float = 0.0,
     ) -> None:
         self._file = open(path, "ab", buffering=0)
         self._fails, self._good, self._failures = fails, good, failures
-        self._done, self._slow, self._slow_reads = 0, slow, slow_reads
+        self._done, self._slow, self._slow_reads, self._slow_brake = 0, slow, slow_reads, slow_brake
 
     def read(self) -> SensorFrame:
         self._try("read")
@@ -43,6 +50,7 @@ class ScriptedRobot:
 
     def brake(self) -> None:
         self._note("brake")
+        time.sleep(self._slow_brake)
 
     def close(self) -> None:
         self._note("close")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -265,7 +266,7 @@ def test_a_thread_that_the_robots_driver_leaves_running_keeps_no_process(tmp_pat
     try:
         robot.read()
         if fails:
-            with pytest.raises(RobotGone, match=r"ended with status 1: OSError: read: bus error \(scripted_robot.py:"):
+            with pytest.raises(RobotGone, match=r": OSError: read: bus error \(scripted_robot.py:"):
                 while True:
                     robot.read()
                     time.sleep(0.005)
@@ -309,6 +310,7 @@ def test_a_robot_that_keeps_commands_waiting_again_and_again_is_told_of():
     def looked(*gaps: float) -> float:
         for gap in gaps:
             looked.now += gap
+            adapter._kept = gap  # by `read` and `send`
             adapter._obey(looked.now)
         return float(status[SLOW])
 
@@ -319,6 +321,51 @@ def test_a_robot_that_keeps_commands_waiting_again_and_again_is_told_of():
     assert looked(*[0.12] * 10) == pytest.approx(0.12)
     assert looked(*[0.01] * 140) == pytest.approx(0.12) and looked(*[0.01] * 60) == 0.0
     os.close(memory)
+
+
+class Unspeakable(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("never to be said")
+
+
+@pytest.mark.parametrize("error", [OSError("bad packet " + 1_000_000 * "x"), Unspeakable()])
+def test_a_robot_is_braked_at_once_whatever_its_error_looks_like(error, capfd):
+    memory, robot = shared_memory(STATUS + 2 * Mailbox.size(CAPACITY)), Puck(control_period=0.02)
+    calls, ours = socket.socketpair()
+    news, wake = os.pipe()
+    adapter, read, done = Adapter(robot, news, ours.fileno(), memory), robot.read, []
+
+    def failing() -> SensorFrame:
+        if len(done) == 3:
+            robot.log.append("failed")
+            raise error
+        done.append("read")
+        return read()
+
+    robot.read = failing
+    assert adapter.run() == 1
+    after = robot.log[robot.log.index("failed") + 1 :]
+    assert after[0] == "brake" and after[-1] == "close" and len(after) > 10
+    assert type(error).__name__ in capfd.readouterr().err
+    said = calls.recv(65536).splitlines()[-1]
+    assert type(error).__name__ in json.loads(said)["gone"] and len(said) < 1500
+    for each in (news, wake, memory):
+        os.close(each)
+    calls.close()
+    ours.close()
+
+
+def test_a_robot_whose_brake_is_slow_is_driven(tmp_path):
+    robot = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log"), "slow_brake": 0.06})
+    try:
+        robot.read()
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            robot.brake()
+            time.sleep(0.02)
+        assert robot.trouble() is None
+    finally:
+        robot.close()
 
 
 def test_the_control_process_knows_of_a_robot_that_is_too_slow(tmp_path):
