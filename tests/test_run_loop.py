@@ -26,7 +26,7 @@ from hiernav.drive import main as drive_main
 from hiernav.drive.arguments import make_parser, settings_of
 from hiernav.drive.exits import FAULT
 from hiernav.drive.screen import new_folder
-from hiernav.runtime import process_robot
+from hiernav.runtime import dry_run, process_robot
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.worlds import sample_layout
@@ -84,13 +84,17 @@ def refused(script: ModuleType, capsys: pytest.CaptureFixture[str], tmp_path: Pa
     return run
 
 
-def test_a_simulated_robot_passes_the_dry_run(script, capsys):
+def test_a_simulated_robot_passes_the_dry_run(script, capsys, monkeypatch):
+    monkeypatch.setattr(dry_run, "LOOK", 0.3)
+    monkeypatch.setattr(dry_run, "WAKES", 1)
     assert script.main(["--dry-run", "--bundle", str(SCRIPT.parent / "bundles" / "point")]) == 0
     assert "error" not in capsys.readouterr().out
 
 
 def test_a_robot_that_does_not_end_fails_the_dry_run(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(process_robot, "CLOSING", 0.2)
+    monkeypatch.setattr(dry_run, "LOOK", 0.3)
+    monkeypatch.setattr(dry_run, "WAKES", 1)
     adapter = tmp_path / "stuck.py"
     example = str(SCRIPT.parent)
     adapter.write_text(
