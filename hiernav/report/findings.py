@@ -100,7 +100,7 @@ def _paper_table3(book: Book) -> Finding:
             missed.append(f"{world} (failed: {'; '.join(sorted(failed))})")
         elif found:
             best = max(found, key=lambda label: (found[label][0], -found[label][1]))
-            missed.append(f"{world} ({best}: {_how_short(world, *found[best])})")
+            missed.append(f"{world} ({best}: {_how_short(world, *found[best])}{_with_astar(book, world)})")
         else:
             missing.append(world)
     return _verdict(book, target, len(met), missed, missing, "worlds", met)
@@ -126,6 +126,18 @@ def _how_short(world: str, reach: float, steps: float) -> str:
         arriving = (steps - (1.0 - reach) * parse_world(world).max_steps) / max(reach, 1e-9)
         short.append(f"{steps:.1f} steps against {best_steps:.1f}, {arriving:.1f} where it reaches the goal")
     return ", ".join(short)
+
+
+def _with_astar(book: Book, world: str) -> str:
+    """What A* in the place of the shipped robot's planner says of why, where that was driven."""
+    group = book.group("astar", "astar", TABLE3_ROBOT, world)
+    reach, steps = group.estimate("reach_rate", "paper"), group.estimate("steps_mean", "paper")
+    if reach is None or steps is None:
+        return ""
+    best_reach, best_steps = paper.best_of_table3(world)
+    still = reach.mean < best_reach or steps.mean > best_steps
+    why = "the skill falls short, whoever plans" if still else "the learned planner is the cause"
+    return f"; with A* plans the shipped one reaches {reach.mean:.3f} in {steps.mean:.1f} steps: {why}"
 
 
 def _strict(book: Book, robot: str) -> Finding:

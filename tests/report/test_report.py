@@ -663,6 +663,24 @@ def with_reach(rate: float, steps: float = 30.0):
     return change
 
 
+@pytest.mark.parametrize(
+    ("steps", "why"), [(50.0, "the skill falls short, whoever plans"), (30.0, "the learned planner is the cause")]
+)
+def test_what_a_star_reaches_says_why_the_paper_s_best_is_missed(tmp_path, steps, why):
+    slow = with_reach(1.0, steps=90.0)
+
+    def change(cell):
+        if (cell.experiment, cell.robot) != ("astar", "doggo"):
+            return slow(cell)
+        result = made_up.result_of(cell)
+        changes = {"reach_rate": 1.0, "steps_mean": steps}
+        return msgspec.structs.replace(result, metrics={k: {**v, **changes} for k, v in result.metrics.items()})
+
+    made_up.write_all(tmp_path / "results", change)
+    text = told.findings(Book.open(tmp_path / "results"))[0].text
+    assert f"with A* plans the shipped one reaches 1.000 in {steps:.1f} steps: {why}" in text
+
+
 @pytest.mark.parametrize(("rate", "met"), [(1.0, True), (0.9, False)])
 def test_targets_are_judged_by_the_numbers(tmp_path, rate, met):
     made_up.write_all(tmp_path / "results", with_reach(rate))
