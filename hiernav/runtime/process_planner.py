@@ -75,7 +75,7 @@ class ProcessPlanner:
         """How long the planner took, as it says itself."""
         self._descriptor = shared_memory(PlannerMemory.size(map_pixels, waypoints, settings, bundle.planner))
         self._memory = PlannerMemory.create(mapped(self._descriptor), map_pixels, waypoints, settings, bundle.planner)
-        self._asked_at, self._questions = os.pipe()
+        self._read_end, self._questions = os.pipe()
         os.set_blocking(self._questions, False)
         self._child = self._start_keeper()
         self._asked: OrderedDict[int, _Asked] = OrderedDict()
@@ -180,13 +180,13 @@ class ProcessPlanner:
         if self._questions >= 0:
             os.close(self._questions)
             self._questions = -1
-            os.close(self._asked_at)
+            os.close(self._read_end)
             self._child.close(family=True)
             os.close(self._descriptor)
 
     def _start_keeper(self) -> Child:
         self._starts_before = self.status.starts
-        descriptors = (self._asked_at, self._descriptor)
+        descriptors = (self._read_end, self._descriptor)
         return Child("hiernav.runtime.planner_process", descriptors, descriptors)
 
     def _count(self, start: int, counts: Mapping[str, int]) -> None:
