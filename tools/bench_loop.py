@@ -3,6 +3,7 @@
 
     bench_loop.py                         60 s each at 50 and 100 Hz, then at 50 Hz beside two CPU hogs; 10 s at 500 Hz
     bench_loop.py --rate 50 --seconds 60 --hogs 2
+    bench_loop.py --rate 100 --host       what the machine leaves of a loop that does nothing but 0.3 ms of sums
 
 Planner and robot live in processes of their own, as when a robot is driven; each line is a control process of its own.
 """
@@ -16,6 +17,8 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,8 @@ from hiernav.files import write_json  # noqa: E402
 WORLD = "pillar(4,4,40)"
 RUNS = ((50, 60.0, 0), (100, 60.0, 0), (50, 60.0, 2), (500, 10.0, 0))
 """Rate [Hz], time [s] and number of hogs of each run."""
+HOST_WORK = 3e-4
+"""What a tick of `measure_host` computes for, with nothing between the ticks [s]."""
 
 
 def main() -> int:
@@ -38,6 +43,9 @@ def main() -> int:
     parser.add_argument("--rate", type=int, choices=(50, 100, 500), help="only one run, at so many ticks a second")
     parser.add_argument("--seconds", type=number_from(1.0), default=60.0, help="of that run (60)")
     parser.add_argument("--hogs", type=whole(0), default=0, help="processes that compute beside that run (0)")
+    parser.add_argument(
+        "--host", action="store_true", help="that run without hiernav's tick: the limit of this machine"
+    )
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="of the point robot")
     parser.add_argument(
         "--rehearsal", type=number_from(0.0), default=0.0025, help="before each tick [s]; 0 for none (0.0025)"
@@ -46,7 +54,12 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     arguments = parser.parse_args()
     if arguments.rate is None:
+        if arguments.host:
+            parser.error("--host needs --rate")
         found = bench_loop(arguments.bundle, arguments.normal)
+    elif arguments.host:
+        found = [measure_host(arguments.rate, arguments.seconds, arguments.hogs, arguments.normal)]
+        show_host(found[0])
     else:
         settings = (arguments.seconds, arguments.hogs, arguments.bundle, arguments.normal, arguments.rehearsal)
         found = [measure(arguments.rate, *settings)]
@@ -140,15 +153,11 @@ def measure(
 
     driver.audience.observers = [Guide()]
     granted = request_realtime(RealtimeConfig(fifo_priority=None) if normal else RealtimeConfig())
-    beside = [multiprocessing.get_context("fork").Process(target=hog, daemon=True) for _ in range(hogs)]
-    for process in beside:
-        process.start()
     began = time.monotonic()
     try:
-        driver.serve()
+        with beside(hogs):
+            driver.serve()
     finally:
-        for process in beside:
-            process.kill()
         trips = robot.watchdog_trips
         robot.close()
         link.close()
@@ -173,12 +182,73 @@ def measure(
     }
 
 
+def measure_host(rate: int, seconds: float, hogs: int, normal: bool) -> dict[str, Any]:
+    """The same loop and settings with a tick of fixed arithmetic, and no process beside it but the hogs.
+
+    What is missed here, no program on this machine can keep: `tick` is `warm` (`HOST_WORK` or a little more, measured
+    without pauses) and what the machine adds to it.
+    """
+    from hiernav.runtime.clock import MonotonicClock
+    from hiernav.runtime.loop import FixedRateLoop
+    from hiernav.runtime.realtime import RealtimeConfig, request_realtime
+    from hiernav.runtime.timing import Histogram
+
+    factor, tick, warm = np.full((64, 64), 0.5), Histogram(), Histogram()
+    sums, end = 0, 0.0
+
+    def work() -> None:
+        for _ in range(sums):
+            factor @ factor
+
+    def timed(spent: Histogram) -> None:
+        began = time.perf_counter()
+        work()
+        spent.record(time.perf_counter() - began)
+
+    def step(now: float) -> bool:
+        timed(tick)
+        return now > end
+
+    granted = request_realtime(RealtimeConfig(fifo_priority=None) if normal else RealtimeConfig())
+    while warm.summary()["p50"] is None or warm.summary()["p50"] < HOST_WORK:
+        sums, warm = sums + max(1, sums // 8), Histogram()
+        for _ in range(200):
+            timed(warm)
+    clock = MonotonicClock()
+    loop = FixedRateLoop(clock, 1.0 / rate, step, lambda: None)
+    with beside(hogs):
+        end = clock.now() + seconds
+        loop.run()
+    return {
+        "rate": rate,
+        "seconds": seconds,
+        "hogs": hogs,
+        "realtime": granted,
+        "ticks": loop.ticks,
+        "missed": loop.overruns / max(loop.ticks + loop.overruns, 1),
+        "lateness": loop.lateness.summary(),
+        "warm": warm.summary(),
+        "tick": tick.summary(),
+    }
+
+
+def show_host(found: dict[str, Any]) -> None:
+    """One run of `measure_host` on a line."""
+    print(
+        f"host {found['rate']} Hz, {found['seconds']:.0f} s, {found['hogs']} hogs, "
+        f"{found['realtime']['sched_fifo']}: missed {100 * found['missed']:.3f} % of {found['ticks']} ticks, "
+        f"p50 p99 max [ms] of lateness {times(found['lateness'])}, "
+        f"of a tick {times(found['tick'])}, which takes {times(found['warm'])} without pauses",
+        flush=True,
+    )
+
+
+def times(entry: dict[str, Any]) -> str:
+    return " ".join("-" if entry[key] is None else f"{1e3 * entry[key]:.3f}" for key in ("p50", "p99", "max"))
+
+
 def show(found: dict[str, Any]) -> None:
     """One run on three lines."""
-
-    def times(entry: dict[str, Any]) -> str:
-        return " ".join("-" if entry[key] is None else f"{1e3 * entry[key]:.3f}" for key in ("p50", "p99", "max"))
-
     print(
         f"loop {found['rate']} Hz, {found['seconds']:.0f} s, {found['hogs']} hogs, "
         f"{found['realtime']['sched_fifo']}: missed {100 * found['missed']:.3f} % of {found['ticks']} ticks, "
@@ -195,7 +265,20 @@ def show(found: dict[str, Any]) -> None:
     )
 
 
-def hog() -> None:
+@contextmanager
+def beside(hogs: int) -> Iterator[None]:
+    """So many processes that compute all the time, meanwhile."""
+    processes = [multiprocessing.get_context("fork").Process(target=_hog, daemon=True) for _ in range(hogs)]
+    for process in processes:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+
+
+def _hog() -> None:
     while True:
         pass
 
