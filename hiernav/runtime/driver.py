@@ -306,7 +306,7 @@ class Driver:
             self._rehearsal(frame, estimate, trip.goal, occupancy, anew=not again)
         except Exception:
             log.exception("the rehearsal failed and is dropped")
-            self.loop.drop_preparation()
+            self.loop.drop_preparation("it failed")
 
     def _tick(self, now: float) -> bool:
         """One control step; True when the run is over. What goes wrong in it is a fault, not an exception."""

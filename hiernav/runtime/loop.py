@@ -15,8 +15,10 @@ from hiernav.runtime.clock import Clock
 from hiernav.runtime.timing import Histogram
 
 BRAKE_ATTEMPTS = 3
-SPOILT = 10
-"""Deadlines in a row that were missed for preparing for them, after which nothing is prepared any more."""
+SPOILT, FORGIVEN = 4, 500
+"""Deadlines that may be missed for preparing for them, one of them forgotten after every so many preparations; with one
+more nothing is prepared any more. Preparing doubles what is computed: on a machine that takes the processor away from
+whoever computes, that is worse than cold caches."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks for an end. A SIGHUP that is ignored, as under nohup, asks for none."""
 
@@ -84,7 +86,9 @@ class FixedRateLoop:
         self._brake = brake
         self._handle_signals = handle_signals
         self._prepare, self._lead, self._ahead, self._again = prepare, lead, lead, 0.5 * lead
-        self._spoilt = 0
+        self._spoilt = 0.0
+        self.unprepared = ""
+        """Why nothing is prepared any more, if something was."""
         self._leaving = True
         self._signalled = False
         self._stopped = False
@@ -96,9 +100,9 @@ class FixedRateLoop:
         """
         self._stopped = True
 
-    def drop_preparation(self) -> None:
+    def drop_preparation(self, why: str) -> None:
         """Do without `prepare` from now on."""
-        self._prepare = None
+        self._prepare, self.unprepared = None, why
 
     def run(self) -> LoopExit:
         """Run until `tick` returns True, `stop` is called, or a signal or exception arrives.
@@ -150,15 +154,16 @@ class FixedRateLoop:
         if began > deadline:  # woken too late, by no fault of the preparation
             return
         self._prepare(False)
-        first = self.clock.now()
-        self._spoilt = self._spoilt + 1 if first > deadline else 0
-        if self._spoilt >= SPOILT:
-            log.warning("preparing takes %.1f ms, which makes ticks late: dropped", 1e3 * (first - began))
-            self.drop_preparation()
+        ready = first = self.clock.now()
         again = max(0.95 * self._again, 0.5 * (first - began))  # the first has warmed the caches for it
         if self._prepare is not None and first + again <= deadline:
             self._prepare(True)
-            again = max(again, self.clock.now() - first)
+            ready = self.clock.now()
+            again = max(again, ready - first)
+        self._spoilt = max(self._spoilt - 1.0 / FORGIVEN, 0.0) + (ready > deadline)
+        if self._spoilt > SPOILT:
+            log.warning("preparing makes too many ticks late, this one by %.1f ms: dropped", 1e3 * (ready - deadline))
+            self.drop_preparation("it made ticks late")
         self._again = again
         # as late as it may be begun: what lies between would only get cold again
         self._ahead = min(max(first - began + again + 1e-4, 0.95 * self._ahead), self._lead)

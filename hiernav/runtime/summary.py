@@ -43,7 +43,7 @@ def summarise(account: Account, timer: TickTimer, loop: FixedRateLoop, realtime:
         "replans": dict(account.replans),
         "plans": dict(account.plans),
         "guard": dict(account.guard),
-        "realtime": dict(realtime),
+        "realtime": {**realtime, **({"rehearsal": f"dropped: {loop.unprepared}"} if loop.unprepared else {})},
     }
 
 

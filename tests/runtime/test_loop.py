@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hiernav.runtime.clock import FakeClock, MonotonicClock
-from hiernav.runtime.loop import SPOILT, FixedRateLoop, LoopExit
+from hiernav.runtime.loop import FORGIVEN, SPOILT, FixedRateLoop, LoopExit
 
 PERIOD = 0.25
 
@@ -347,18 +347,38 @@ def test_a_preparation_comes_before_its_deadline_and_never_delays_a_tick_that_ha
     assert prepared[-rounds] == pytest.approx(199 * PERIOD - min(0.0201, lead), abs=1e-3)
 
 
-def test_a_preparation_that_keeps_making_ticks_late_is_dropped(caplog):
+@pytest.mark.parametrize(("again", "every"), [(False, 1), (False, 100), (True, 100)])
+def test_a_preparation_that_keeps_making_ticks_late_is_dropped(caplog, again, every):
     clock, prepared, late = FakeClock(), [0], []
 
-    def prepare(again: bool) -> None:
-        prepared[0] += 1
-        clock.advance(0.03)
+    def prepare(second: bool) -> None:
+        prepared[0] += second is again
+        clock.advance(0.03 if second is again and prepared[0] % every == 0 else 0.001)
 
-    loop = FixedRateLoop(clock, PERIOD, lambda now: late.append(loop.late) or len(late) == 50, lambda: None,
-                         prepare=prepare, lead=0.02)  # fmt: skip
+    def tick(now: float) -> bool:
+        late.append(loop.late)
+        return len(late) == 7 * every
+
+    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=prepare, lead=0.02)
     loop.run()
-    assert prepared[0] == SPOILT and "preparing takes 30.0 ms" in caplog.text
-    assert late[SPOILT] > 0.009 and not any(late[SPOILT + 1 :])
+    assert prepared[0] == (SPOILT + 1) * every and sum(by > 0.009 for by in late) == SPOILT + 1
+    assert "preparing makes too many ticks late" in caplog.text and loop.unprepared == "it made ticks late"
+
+
+def test_a_preparation_that_seldom_makes_a_tick_late_goes_on():
+    clock, prepared, ticks = FakeClock(), [0], [0]
+
+    def prepare(again: bool) -> None:
+        prepared[0] += not again
+        clock.advance(0.03 if not again and prepared[0] % (2 * FORGIVEN) == 0 else 0.001)
+
+    def tick(now: float) -> bool:
+        ticks[0] += 1
+        return ticks[0] == 20 * FORGIVEN
+
+    loop = FixedRateLoop(clock, PERIOD, tick, lambda: None, prepare=prepare, lead=0.02)
+    loop.run()
+    assert prepared[0] == 20 * FORGIVEN - 1 and not loop.unprepared
 
 
 def test_a_loop_that_is_woken_too_late_to_prepare_blames_itself(caplog):

@@ -174,7 +174,7 @@ MUTANTS = (
     Mutant("hold without a way", WATCH, "waited > self.hold_after else", "False else",
            f"{F}/test_26_obstacle_moves_in.py"),
     Mutant("stop in time", WATCH, "now - self._since > self.timeout:", "False:", f"{T}/test_driver.py"),
-    Mutant("rehearsal that takes too long", f"{R}/loop.py", "if self._spoilt >= SPOILT:", "if False:",
+    Mutant("rehearsal that takes too long", f"{R}/loop.py", "if self._spoilt > SPOILT:", "if False:",
            f"{T}/test_loop.py"),
     Mutant("plan on its way to another goal", f"{R}/pilot.py", "if len(self.agent.turn_to(goal[None])):", "if False:",
            f"{T}/test_pilot.py"),
