@@ -16,9 +16,11 @@ from hiernav.runtime.timing import Histogram
 
 BRAKE_ATTEMPTS = 3
 SPOILT, FORGIVEN = 4, 500
-"""Deadlines that may be missed for preparing for them, one of them forgotten after every so many preparations; with one
+"""Ticks that may be late for having been prepared, one of them forgotten after every so many preparations; with one
 more nothing is prepared any more. Preparing doubles what is computed: on a machine that takes the processor away from
 whoever computes, that is worse than cold caches."""
+LATE = 0.05
+"""Share of a period by which such a tick is late."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What asks for an end. A SIGHUP that is ignored, as under nohup, asks for none."""
 
@@ -160,7 +162,7 @@ class FixedRateLoop:
             self._prepare(True)
             ready = self.clock.now()
             again = max(again, ready - first)
-        self._spoilt = max(self._spoilt - 1.0 / FORGIVEN, 0.0) + (ready > deadline)
+        self._spoilt = max(self._spoilt - 1.0 / FORGIVEN, 0.0) + (ready > deadline + LATE * self.period)
         if self._spoilt > SPOILT:
             log.warning("preparing makes too many ticks late, this one by %.1f ms: dropped", 1e3 * (ready - deadline))
             self.drop_preparation("it made ticks late")
