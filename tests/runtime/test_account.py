@@ -392,6 +392,16 @@ def summary_of(account: Account, loop: FixedRateLoop | None = None, timer: TickT
     return summarise(account, timer or TickTimer(), loop, {})
 
 
+def test_a_summary_tells_that_ticks_are_no_longer_rehearsed():
+    loop = FixedRateLoop(FakeClock(), 0.1, lambda _: True, lambda: None, prepare=lambda again: None, lead=0.01)
+    assert "rehearsal" not in summary_of(account_of(1), loop)["realtime"]
+    loop.drop_preparation("it made ticks late")
+    summary, screen = summary_of(account_of(1), loop), io.StringIO()
+    assert summary["realtime"]["rehearsal"] == "dropped: it made ticks late"
+    print_summary(summary, Console(file=screen, width=120))
+    assert "rehearsal dropped: it made ticks late" in screen.getvalue()
+
+
 def test_an_acknowledgement_is_one_of_all_that_had_gone_wrong():
     account = Account()
     watch = FaultWatch(account)
