@@ -88,7 +88,8 @@ def test_a_simulated_robot_passes_the_dry_run(script, capsys, monkeypatch):
     monkeypatch.setattr(dry_run, "LOOK", 0.3)
     monkeypatch.setattr(dry_run, "WAKES", 1)
     assert script.main(["--dry-run", "--bundle", str(SCRIPT.parent / "bundles" / "point")]) == 0
-    assert "error" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "error" not in out and "guard.slow_ttc" in out  # a setting of point.yaml
 
 
 def test_a_robot_that_does_not_end_fails_the_dry_run(monkeypatch, tmp_path, capsys):

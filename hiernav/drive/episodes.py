@@ -33,7 +33,7 @@ from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import Robot
-from hiernav.runtime.settings import Settings
+from hiernav.runtime.settings import Settings, differing
 from hiernav.runtime.summary import print_summary, summarise
 from hiernav.runtime.supervisor import Mode
 from hiernav.runtime.trip import RunResult
@@ -59,6 +59,7 @@ class Episodes:
         link: ProcessPlanner | None,
     ) -> None:
         self.arguments, self.layouts, self.remote, self.link = arguments, layouts, remote, link
+        self.settings = settings
         self.layout = layouts[0]
         self.interrupted = self.failed = False
         self.serves = serves = arguments.serve or arguments.view is not None
@@ -234,6 +235,7 @@ class Episodes:
 
     def _summary(self, drives: Sequence[Drive]) -> dict[str, Any]:
         summary = summarise(self.account, self.driver.timer, self.driver.loop, self.granted)
+        summary["settings"] = differing(self.settings)
         summary["recording"] = None if self.recorder is None else self.recorder.summary()
         summary["startup_seconds"] = drives[0].armed_age if drives else None
         if self.remote is not None:

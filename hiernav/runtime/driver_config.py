@@ -7,6 +7,12 @@ from dataclasses import dataclass
 
 from hiernav.nav.goal import GOAL_RADIUS
 
+AT_MOST = {
+    "first_estimate": 60.0, "no_way_at_start": 60.0, "no_way_hold": 10.0, "no_way": 600.0, "plan_slow": 10.0,
+    "plan_hold": 10.0, "hold_timeout": 600.0, "stop_speed": 1.0, "stop_turn": 10.0, "stop_timeout": 30.0,
+}  # fmt: skip
+"""Values beyond which a watch would be none, by the names in `DriverConfig`."""
+
 
 @dataclass(frozen=True)
 class DriverConfig:
@@ -50,5 +56,7 @@ class DriverConfig:
         for name, value in self.__dict__.items():
             if not (isinstance(value, bool) or math.isfinite(value) and value > 0):
                 raise ValueError(f"DriverConfig.{name} = {value} must be finite and positive")
+            if value > AT_MOST.get(name, math.inf):
+                raise ValueError(f"DriverConfig.{name} = {value} must be at most {AT_MOST[name]:g}")
         if not self.plan_slow < self.plan_hold:
             raise ValueError(f"DriverConfig.plan_slow = {self.plan_slow} must be less than plan_hold")

@@ -21,7 +21,7 @@ from hiernav.runtime.policy import check_golden, load_networks, require_fit
 from hiernav.runtime.process_robot import ProcessRobot
 from hiernav.runtime.realtime import request_realtime
 from hiernav.runtime.robot import READINGS, SIZES, SensorFrame
-from hiernav.runtime.settings import Settings
+from hiernav.runtime.settings import Settings, differing
 from hiernav.runtime.timing import Histogram
 
 LOOK, PATIENCE = 2.5, 15.0
@@ -35,7 +35,8 @@ PERIOD = 0.005
 def report(
     open_bundle: Callable[[], Bundle], make_robot: Callable[[], ProcessRobot], settings: Settings
 ) -> dict[str, Any]:
-    """Findings on bundle, robot, estimator and host, in JSON's own types; what failed has an "error"."""
+    """Findings on bundle, robot, estimator and host, and settings that are not the defaults, in JSON's own types; what
+    failed has an "error"."""
     bundle: list[Bundle] = []
 
     def check_bundle() -> dict[str, Any]:
@@ -46,6 +47,7 @@ def report(
     found["robot"] = _attempt(lambda: _check_robot(make_robot(), bundle[0] if bundle else None, settings))
     found["estimator"] = _attempt(_check_filter)
     found["host"] = _check_host(settings)
+    found["settings"] = differing(settings) or {"all": "defaults"}
     return found
 
 

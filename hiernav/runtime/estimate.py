@@ -19,6 +19,10 @@ class Trust(IntEnum):
     """Waiting does not help any more: a fault."""
 
 
+AT_MOST = {"hold_after": 10.0, "lost_after": 10.0, "fix_hold_after": 60.0, "fix_lost_after": 60.0}
+"""Times beyond which sensors would not be watched [s], by the names in `EstimatorConfig`."""
+
+
 @dataclass(frozen=True)
 class EstimatorConfig:
     """Noise of the sensors (standard deviations per component) and limits of trust."""
@@ -75,6 +79,8 @@ class EstimatorConfig:
             numeric = isinstance(value, int | float) and not isinstance(value, bool)
             if numeric and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"EstimatorConfig.{name} = {value} must be finite and positive")
+            if numeric and value > AT_MOST.get(name, math.inf):
+                raise ValueError(f"EstimatorConfig.{name} = {value} must be at most {AT_MOST[name]:g}")
         if not self.gate_probability < 1.0:
             raise ValueError(f"EstimatorConfig.gate_probability = {self.gate_probability} must be below 1")
         for name in ("reinit_after", "resync_after"):

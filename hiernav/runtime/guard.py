@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MOST_BRAKED = 20
+"""Ticks in a row that may be braked, at most, before it is a fault."""
+
 
 @dataclass(frozen=True)
 class GuardConfig:
@@ -41,8 +44,8 @@ class GuardConfig:
             raise ValueError(f"GuardConfig: limits {self.low} to {self.high} must be finite and include 0, the brake")
         if self.slew_limit is not None and not 0.0 < self.slew_limit < math.inf:
             raise ValueError(f"GuardConfig.slew_limit = {self.slew_limit} must be finite and positive, or None")
-        if self.tilt_limit is not None and not 0.0 < self.tilt_limit <= math.pi:
-            raise ValueError(f"GuardConfig.tilt_limit = {self.tilt_limit} rad must be in (0, pi], or None")
+        if self.tilt_limit is not None and not 0.0 < self.tilt_limit < 0.5 * math.pi:
+            raise ValueError(f"GuardConfig.tilt_limit = {self.tilt_limit} rad must be in (0, pi/2), or None")
         if self.slow_ttc is not None and not 0.0 < self.slow_ttc < math.inf:
             raise ValueError(f"GuardConfig.slow_ttc = {self.slow_ttc} s must be finite and positive, or None")
         if self.saturation is not None and not 0.0 < self.saturation < math.inf:
@@ -50,8 +53,8 @@ class GuardConfig:
         if self.drive is not None and not math.isfinite(self.drive):
             raise ValueError(f"GuardConfig.drive = {self.drive} rad must be finite, or None")
         for name in ("max_non_finite", "max_tilted"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be at least 1")
+            if not 1 <= getattr(self, name) <= MOST_BRAKED:
+                raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be from 1 to {MOST_BRAKED}")
 
 
 @dataclass(frozen=True)

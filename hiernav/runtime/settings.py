@@ -75,6 +75,17 @@ def load_settings(
     )
 
 
+def differing(settings: Settings) -> dict[str, Any]:
+    """The values that are not this package's defaults, by `section.key`, whoever has set them."""
+    usual = Settings()
+    return {
+        f"{section}.{key}": value
+        for section in _SECTIONS
+        for key, value in vars(getattr(settings, section)).items()
+        if value != getattr(getattr(usual, section), key)
+    }
+
+
 def _section(
     name: str, values: Mapping[str, Any], given: Mapping[str, Any], sources: Sequence[tuple[str, str | None]]
 ) -> Any:

@@ -60,6 +60,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
         console.print(f"  after {fault['seconds']:.1f} s: {fault['why']}{after}", highlight=False, markup=False)
     granted = ", ".join(f"{name} {text}" for name, text in summary["realtime"].items()) or "not asked"
     console.print(f"real time: {granted}", highlight=False)
+    if summary.get("settings"):
+        changed = ", ".join(f"{name} {value}" for name, value in summary["settings"].items())
+        console.print(f"settings that are not the defaults: {changed}", highlight=False, markup=False)
 
 
 def _rate(loop: FixedRateLoop) -> float:

@@ -374,6 +374,7 @@ def test_an_error_out_of_the_loop_is_a_fault_and_costs_nothing_of_what_was_drive
     assert run(*SHORT, "--episodes", "3", "--no-pictures", "--record", "a.mcap") == exits.FAULT
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     assert [episode["reason"] for episode in summary["episodes"]] == ["timeout"] and len(goals) == 2
+    assert summary["settings"]["driver.max_steps"] == 3
     assert [fault["why"] for fault in summary["faults"]["newest"]] == ["ZeroDivisionError: division by zero"]
     assert summary["recording"]["ticks"] == summary["timing"]["ticks"]
     assert (tmp_path / "a.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")

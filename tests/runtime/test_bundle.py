@@ -207,6 +207,14 @@ def test_external_weights_are_found_in_the_defaults_of_a_function_s_attributes()
     assert inspect_onnx(model.SerializeToString()).external_data
 
 
+@pytest.mark.parametrize("part", ["values", "indices"])
+def test_external_weights_are_found_in_sparse_ones(part):
+    model = onnx.load_from_string(skill_bytes())
+    weight = onnx.load_from_string(with_external_weights()).graph.initializer[0]
+    getattr(model.graph.sparse_initializer.add(), part).CopyFrom(weight)
+    assert inspect_onnx(model.SerializeToString()).external_data
+
+
 def test_a_model_that_is_to_be_trained_is_refused(folder):
     model = onnx.load_from_string(skill_bytes())
     model.training_info.add().algorithm.name = "sgd"

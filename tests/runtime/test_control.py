@@ -307,6 +307,13 @@ def test_only_this_user_may_connect_and_two_loops_do_not_share_a_socket(serving)
         ControlServer(driver, path)
 
 
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(control.os, "getuid", lambda: tmp_path.stat().st_uid + 1)
+    with pytest.raises(ValueError, match="the folder belongs to another user"):
+        ControlServer(driver_of(), tmp_path / "loop.sock")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_socket_that_somebody_removed_is_still_taken(tmp_path):
     path = tmp_path / "loop.sock"
     with ControlServer(driver_of(), path):

@@ -569,6 +569,42 @@ def test_a_robot_that_says_it_is_in_trouble_waits_and_goes_on():
     assert len(held) == 10 and all(record.sent is None for record in held)
 
 
+@pytest.mark.parametrize("part", ["robot", "pilot"])
+def test_a_robot_is_braked_in_every_tick_that_raises(part):
+    robot, pilot, braked = Puck(noise=1e-3), Scripted(), []
+
+    class Operator(Observer):
+        def make_requests(self) -> None:
+            braked.append(robot.log.count("brake"))
+            if len(braked) == 2:
+                driver.set_goal(GOAL)
+            elif len(braked) == 10:  # from the next tick on
+                assert driver.supervisor.mode is Mode.RUNNING
+                setattr(robot, "read", fails) if part == "robot" else setattr(pilot, "act", fails)
+            elif len(braked) == 60:
+                driver.quit()
+
+    def fails(*_: object) -> None:
+        raise OSError("bus error")
+
+    driver = driver_of(robot, pilot, observers=[Operator()])
+    driver.serve()
+    assert driver.supervisor.fault.startswith("OSError: bus error")
+    assert (np.diff(braked[11:]) >= 1).all()
+
+
+def test_a_planner_that_has_failed_for_good_is_a_fault_in_that_tick():
+    robot, pilot, seen = Puck(), Scripted(), Listener()
+
+    def script(step: int, straight: np.ndarray) -> np.ndarray:
+        pilot.failed = "the planner's process failed again" if step >= 5 else None
+        return straight
+
+    pilot.script = script
+    result = driver_of(robot, pilot, observers=[seen]).run(GOAL)
+    assert result.fault == "the planner's process failed again" and len(robot.sent) == 5
+
+
 @pytest.mark.parametrize("error", [RobotGone("it ended: bus error"), OSError("bus error")])
 def test_a_stop_that_nobody_can_see_is_not_said_to_last_too_long(error):
     robot = Puck(noise=1e-3)

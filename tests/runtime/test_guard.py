@@ -119,11 +119,26 @@ def test_a_new_run_starts_with_a_clean_slate():
 
 @pytest.mark.parametrize(
     "settings",
-    [{"low": 0.1}, {"high": math.inf}, {"slew_limit": 0.0}, {"tilt_limit": 4.0}, {"max_non_finite": 0}],
+    [
+        {"low": 0.1},
+        {"high": math.inf},
+        {"slew_limit": 0.0},
+        {"tilt_limit": 1.6},
+        {"max_non_finite": 0},
+        {"max_non_finite": 21},
+        {"max_tilted": 0},
+        {"max_tilted": 10**9},
+    ],
 )
 def test_limits_that_would_switch_the_guard_off_are_refused(settings):
     with pytest.raises(ValueError, match="GuardConfig"):
         GuardConfig(**settings)
+
+
+def test_a_time_to_collision_that_is_not_known_stops_what_drives():
+    guard = Guard(2, GuardConfig(slow_ttc=1.0, slowed=(0,)))
+    np.testing.assert_array_equal(guard.check(np.array([1.0, 0.5]), ttc=math.nan).action, [0.0, 0.5])
+    assert guard.counts["slowed"] == 1
 
 
 DRIVE = GuardConfig(slow_ttc=1.0, saturation=0.02, drive=-math.pi / 2)

@@ -14,7 +14,7 @@ from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 from recorded_drive import drive
 
-from hiernav.runtime import messages
+from hiernav.runtime import log_reader, messages
 from hiernav.runtime.log_reader import MAX_RECORD_BYTES, LogError, RunLog
 from hiernav.runtime.messages import MessageError
 from hiernav.runtime.observe import Event, TickRecord
@@ -121,6 +121,12 @@ def test_a_chunk_that_inflates_without_end_takes_no_memory(tmp_path):
         Chunk("zstd", bomb, 0, 0, 0, promised).write(builder)
     instead_of_the_end(path, builder.end())
     assert bounded(path) == 0
+
+
+def test_a_chunk_that_promises_too_much_is_not_inflated(monkeypatch):
+    monkeypatch.setattr(zstandard, "ZstdDecompressor", None)
+    with pytest.raises(ValueError, match="chunk of 64000001 bytes"):
+        log_reader._inflated(Chunk("zstd", zstandard.compress(b""), 0, 0, 0, MAX_RECORD_BYTES + 1))
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(65536, 65536), (0, 5), (-1, -1), (16384, 16384), (10, 10)])

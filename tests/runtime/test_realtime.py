@@ -30,6 +30,18 @@ def test_what_is_not_asked_for_is_left_alone():
     assert report == dict.fromkeys(SETTINGS, "not asked")
 
 
+def test_processes_that_are_started_later_are_not_real_time():
+    """A planner at the loop's priority would take the processor from it."""
+    report = in_a_process_of_its_own(
+        "import os\n"
+        "asked = []\n"
+        "os.sched_setscheduler = lambda pid, policy, param: asked.append((pid, policy))\n"
+        "report = request_realtime(RealtimeConfig(timer_slack_ns=0, lock_memory=False, freeze_gc=False))\n"
+        "assert asked == [(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK)], asked"
+    )
+    assert report["sched_fifo"].startswith("granted")
+
+
 def test_what_the_system_refuses_is_never_raised():
     report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(fifo_priority=99, cpus=(100000,)))")
     assert report["sched_fifo"].startswith(("granted", "refused: "))

@@ -12,7 +12,7 @@ import pytest
 from shipped import ROOT
 
 from hiernav.decode import ConfigError
-from hiernav.runtime.settings import Settings, load_settings
+from hiernav.runtime.settings import Settings, differing, load_settings
 
 
 @pytest.mark.parametrize("robot", ["point", "car", "doggo"])
@@ -59,6 +59,15 @@ def test_a_file_goes_over_those_before_it_and_is_blamed_for_what_it_says(tmp_pat
         ("realtime.cpus=[]", "at least one"),
         ("realtime.cpus=[0, -1]", "cpus = [0, -1] must be numbers of CPUs from 0"),
         ("realtime.timer_slack_ns=-1", "timer_slack_ns = -1 ns must not be negative"),
+        ("guard.tilt_limit=1.571", "tilt_limit = 1.571 rad must be in (0, pi/2)"),
+        ("guard.max_tilted=21", "max_tilted = 21 must be from 1 to 20"),
+        ("guard.max_non_finite=1000000000", "max_non_finite = 1000000000 must be from 1 to 20"),
+        ("driver.stop_speed=1.1", "stop_speed = 1.1 must be at most 1"),
+        ("driver.stop_timeout=1.0e+12", "stop_timeout = 1000000000000.0 must be at most 30"),
+        ("driver.hold_timeout=601", "hold_timeout = 601.0 must be at most 600"),
+        ("driver.plan_hold=11", "plan_hold = 11.0 must be at most 10"),
+        ("estimator.lost_after=10.1", "lost_after = 10.1 must be at most 10"),
+        ("estimator.fix_lost_after=61", "fix_lost_after = 61.0 must be at most 60"),
         ("driver=1", "expected section.key=value"),
         ("driver.max_steps", "expected section.key=value"),
     ],
@@ -67,6 +76,12 @@ def test_what_is_not_a_setting_is_refused_with_its_name(override, why):
     with pytest.raises(ConfigError) as refused:
         load_settings([], [override])
     assert why in str(refused.value)
+
+
+def test_what_is_not_the_default_is_told_wherever_it_comes_from():
+    assert differing(Settings()) == {}
+    settings = load_settings([ROOT / "deploy" / "doggo.yaml"], ["driver.stop_speed=0.2"], {"driver": {"max_steps": 7}})
+    assert differing(settings) == {"guard.tilt_limit": 1.31, "driver.stop_speed": 0.2, "driver.max_steps": 7}
 
 
 def places(section: str = "", kind: object = Settings) -> Iterator[tuple[str, int | None]]:

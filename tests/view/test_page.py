@@ -174,7 +174,6 @@ def test_a_button_asks_for_what_it_says_however_often_it_is_pressed(monkeypatch)
 
 
 @needs_viser
-@pytest.mark.slow
 def test_the_page_is_for_this_machine_and_for_its_own_site_only(tmp_path):
     """It listens on 127.0.0.1 alone, and refuses what a page of another site, in the same browser, would send."""
     import websockets.sync.client as client
