@@ -46,8 +46,8 @@ def test_the_same_case_gives_the_same_outcome_and_a_slow_planner_another(tool):
     assert outcome(tool.Case(filter=False, noise=4.0)) != outcome(tool.Case(noise=4.0))
 
 
-@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
-def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatch, robot):
+def guard_of(tool, monkeypatch, robot: str) -> GuardConfig:
+    """What a drive of that robot would be guarded with."""
     driven = []
 
     class Stop(Exception):
@@ -60,12 +60,25 @@ def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatc
     monkeypatch.setattr(tool, "Driver", driver)
     with pytest.raises(Stop):
         tool.drive(tool.Case(), str(BUNDLES / robot), "gremlin", [0], told=True)
+    (guard,) = (each for each in driven if isinstance(each, Guard))
+    return guard.config
+
+
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_a_robot_is_driven_with_the_settings_that_it_ships_with(tool, monkeypatch, robot):
+    config = guard_of(tool, monkeypatch, robot)
     shipped = tool.robot_settings(get_robot(robot), ROOT / "deploy").guard
     assert (shipped.tilt_limit is None) == (robot == "point")
     bundle = load_bundle(BUNDLES / robot)
-    (guard,) = (each for each in driven if isinstance(each, Guard))
-    assert guard.config == replace(shipped, slew_limit=bundle.manifest.guard.slew_limit)
-    assert guard.config != GuardConfig(slew_limit=bundle.manifest.guard.slew_limit)
+    assert config == replace(shipped, slew_limit=bundle.manifest.guard.slew_limit)
+    assert config != GuardConfig(slew_limit=bundle.manifest.guard.slew_limit)
+
+
+def test_a_robot_whose_own_slew_limit_is_lower_than_its_bundles_is_driven_with_that(tool, monkeypatch):
+    shipped = tool.robot_settings(get_robot("point"), ROOT / "deploy")
+    own = replace(shipped, guard=replace(shipped.guard, slew_limit=0.01))
+    monkeypatch.setattr(tool, "robot_settings", lambda *_: own)
+    assert guard_of(tool, monkeypatch, "point").slew_limit == 0.01
 
 
 def test_robots_have_results_of_their_own(tool, tmp_path, monkeypatch):

@@ -157,7 +157,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
         robot.occupancy,
         clock,
         Estimator(config) if case.filter else RawEstimator(config),  # type: ignore[arg-type]
-        Guard(spec.action_dim, replace(settings.guard, slew_limit=bundle.manifest.guard.slew_limit)),
+        Guard(spec.action_dim, settings.guard.limited(bundle.manifest.guard.slew_limit)),
         replace(settings.driver, max_steps=layouts[0].spec.max_steps),
     )
     outcomes = {}

@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,8 +75,6 @@ class Episodes:
             self._reset = lambda layout: simulated.reset(layout, layout.seed)
         require_fit(bundle, robot)
         faulty = None if arguments.view is None else FaultyRobot(robot, arguments.seed)
-        limits = [limit for limit in (settings.guard.slew_limit, bundle.manifest.guard.slew_limit) if limit is not None]
-        guard = replace(settings.guard, slew_limit=min(limits, default=None))
         driver = settings.driver
         self.driver = Driver(
             faulty or robot,
@@ -85,7 +82,7 @@ class Episodes:
             lambda stamp: self.layout.occupancy(stamp),
             clock,
             Estimator(settings.estimator),
-            Guard(spec.action_dim, guard),
+            Guard(spec.action_dim, settings.guard.limited(bundle.manifest.guard.slew_limit)),
             driver,
             rehearsal=0.0 if arguments.fast else settings.realtime.rehearsal,
         )
@@ -171,6 +168,9 @@ class Episodes:
                     self.account.add_fault(f"{type(error).__name__}: {error}", self.driver.clock.now())
                     show(traceback.print_exc, sys.stderr)
                 finally:
+                    for process in (self.remote, self.link):
+                        if process is not None:
+                            process.dismiss()  # it ends while the run is accounted for
                     if self.recorder is not None:
                         self.recorder.close()
                 try:
@@ -231,7 +231,7 @@ class Episodes:
         return code
 
     def _print(self, text: str) -> None:
-        show(lambda: self.console.print(text, highlight=False, markup=False), self.console.file)
+        show(lambda: self.console.print(text, highlight=False, markup=False, soft_wrap=True), self.console.file)
 
     def _summary(self, drives: Sequence[Drive]) -> dict[str, Any]:
         summary = summarise(self.account, self.driver.timer, self.driver.loop, self.granted)

@@ -7,6 +7,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,8 @@ from pathlib import Path
 from hiernav.runtime.loop import STOP_SIGNALS
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+DYING = 0.5
+"""Time for which a process that was killed is waited for [s]: while a call into the kernel lasts it does not end."""
 
 
 class Child:
@@ -49,6 +52,8 @@ class Child:
             raise
         finally:
             os.close(news)
+        self._dismissed = 0.0
+        self._closed = False
 
     @property
     def ended(self) -> int | None:
@@ -57,28 +62,37 @@ class Child:
 
     def nudge(self, news: bytes = b"n") -> None:
         """Wake it. Never waits: where nobody has looked for long, one wake more or less is no matter."""
-        try:
-            os.write(self._news, news)
-        except (BlockingIOError, BrokenPipeError):
-            pass
+        if self._news >= 0:
+            with suppress(BlockingIOError, BrokenPipeError):
+                os.write(self._news, news)
+
+    def dismiss(self) -> None:
+        """Have it end by itself, and do not wait for it: `close` does, and is to follow."""
+        if self._news >= 0:
+            os.close(self._news)
+            self._news, self._dismissed = -1, time.monotonic()
 
     def close(self, patience: float = 2.0, family: bool = False) -> bool:
-        """Have it end by itself, or kill it after `patience` [s]; `family`: and what it has started and left behind.
+        """Have it end by itself, or kill it `patience` [s] after that was asked for first.
+
+        Args:
+            patience: of `dismiss`, or of this call where there was none before.
+            family: end what it has started and left behind as well.
 
         Returns:
             Whether it has ended by itself.
         """
-        if self._news < 0:
+        if self._closed:
             return True
-        os.close(self._news)
-        self._news = -1
-        ended = True
+        self.dismiss()
+        self._closed = ended = True
         try:
-            self.process.wait(patience)
+            self.process.wait(max(self._dismissed + patience - time.monotonic(), 0.0))
         except subprocess.TimeoutExpired:
             ended = False
             self.process.kill()
-            self.process.wait()
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(DYING)
         if family:
             with suppress(ProcessLookupError, PermissionError):  # nobody of its session is left
                 os.killpg(self.process.pid, signal.SIGKILL)

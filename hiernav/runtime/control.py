@@ -10,7 +10,6 @@ import os
 import select
 import socket
 import stat
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -39,7 +38,8 @@ log = logging.getLogger(__name__)
 def default_socket() -> Path:
     """Where a loop of this user listens: a folder that nobody else can enter."""
     run = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(run) if run else Path(tempfile.gettempdir()) / f"hiernav-{os.getuid()}"
+    # not `tempfile.gettempdir()`, which is another folder, or an error, where the disk is full
+    folder = Path(run) if run else Path(os.environ.get("TMPDIR") or "/tmp") / f"hiernav-{os.getuid()}"
     return folder / "hiernav-control.sock"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,6 +55,11 @@ class GuardConfig:
         for name in ("max_non_finite", "max_tilted"):
             if not 1 <= getattr(self, name) <= MOST_BRAKED:
                 raise ValueError(f"GuardConfig.{name} = {getattr(self, name)} must be from 1 to {MOST_BRAKED}")
+
+    def limited(self, slew_limit: float | None) -> GuardConfig:
+        """The same with the lower of this slew limit, that of a bundle, and its own; None is no limit."""
+        limits = [limit for limit in (self.slew_limit, slew_limit) if limit is not None]
+        return replace(self, slew_limit=min(limits, default=None))
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,15 @@ import time
 from contextlib import suppress
 from typing import Any, TextIO
 
-PATIENCE = 1.0
-"""Time that a reader is given to take something [s]."""
+PATIENCE, BRIEFLY = 1.0, 0.2
+"""Time that a reader is given to take something: of a report, once the end was asked for, and of a complaint [s]."""
 
 
 class PatientWriter(io.RawIOBase):
     """Writes to a descriptor whose reader may have stopped.
 
-    What it does not take within `PATIENCE` is lost, and what follows too, until it takes something again. With
-    `faithful` it is waited for without end, up to `hurry`.
+    Where nothing is taken for `BRIEFLY`, the rest is lost, and what follows too, until something is taken again. With
+    `faithful` it is waited for without end, up to `hurry`, and from then on for `PATIENCE`.
     """
 
     hurried = lost = False
@@ -42,33 +42,46 @@ class PatientWriter(io.RawIOBase):
     def write(self, data: Any) -> int:
         """All of it, or what the reader takes of it; OSError, once, where there is no reader any more."""
         rest = memoryview(data).cast("B")
-        size = len(rest)
-        while rest and not self._gone and self._has_room():
-            try:
-                rest = rest[os.write(self._target, rest) :]
-            except BlockingIOError:  # there is less room than it takes
-                time.sleep(0.01)
-            except OSError:
-                self._gone = True
-                raise
+        size, since = len(rest), None
+        while rest and not self._gone:
+            taken = self._offer(rest)
+            rest = rest[taken:]
+            if taken:
+                self._deaf, since = False, None
+            elif self._deaf:
+                break
+            elif not self._faithful or PatientWriter.hurried:
+                since = since or time.monotonic()
+                self._deaf = time.monotonic() - since > (PATIENCE if self._faithful else BRIEFLY)
         PatientWriter.lost |= self._faithful and len(rest) > 0 and not self._gone
         return size
 
-    def _has_room(self) -> bool:
-        began = None
-        while not select.select([], [self._target], [], 0.0 if self._deaf else 0.05)[1]:
-            if self._deaf:
-                return False
-            if not self._faithful or PatientWriter.hurried:
-                began = began or time.monotonic()
-                self._deaf = time.monotonic() - began > PATIENCE
-        self._deaf = False
-        return True
+    def _offer(self, data: memoryview) -> int:
+        """How much of it is taken within a moment.
+
+        No more is offered than what can be written without waiting to any pipe or socket that has room, whether it
+        could be opened anew or not.
+        """
+        moment = 0.0 if self._deaf else 0.02
+        if not select.select([], [self._target], [], moment)[1]:
+            return 0
+        try:
+            return os.write(self._target, data[: select.PIPE_BUF])
+        except BlockingIOError:  # there is room, but less than it takes
+            time.sleep(moment)
+            return 0
+        except OSError:
+            self._gone = True
+            raise
 
 
-def be_patient() -> None:
-    """Have this process print so: what is reported waits for its reader, what is complained about does not."""
-    sys.stdout, sys.stderr = _patient(sys.stdout, True), _patient(sys.stderr, False)
+def be_patient(reports: bool = True) -> None:
+    """Have this process print so: what is reported waits for its reader, what is complained about does not.
+
+    Args:
+        reports: whether the standard output is for reports; else it is for complaints as well.
+    """
+    sys.stdout, sys.stderr = _patient(sys.stdout, reports), _patient(sys.stderr, False)
 
 
 def hurry() -> None:
@@ -81,7 +94,8 @@ def _patient(stream: TextIO, faithful: bool) -> TextIO:
         return stream
     stream.flush()
     raw = io.BufferedWriter(PatientWriter(stream.fileno(), faithful))
-    return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=stream.line_buffering)
+    at_once = stream.line_buffering or stream.write_through  # the latter alone under PYTHONUNBUFFERED
+    return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=at_once)
 
 
 def _without_blocking(descriptor: int) -> int:

@@ -175,6 +175,10 @@ class ProcessPlanner:
         self._asked.clear()
         self._silent_since = None
 
+    def dismiss(self) -> None:
+        """Have the planner's process end, and do not wait for it: `close` does, and is to follow."""
+        self._child.dismiss()
+
     def close(self) -> None:
         """End the planner's process."""
         if self._questions >= 0:

@@ -168,11 +168,19 @@ class ProcessRobot:
         self._newest = None
         return answer["result"]
 
+    def dismiss(self) -> None:
+        """Have the adapter brake the robot, for a second where it may be rolling, release it, and end.
+
+        Nothing is waited for here, but by `close`, which is to follow.
+        """
+        if not self._driven:
+            self.child.nudge(END)
+        self.child.dismiss()
+
     def close(self) -> None:
-        """Have the adapter brake the robot, for a second where it may be rolling, release it, and end."""
+        """`dismiss`, and wait until the adapter has ended; kill it where that takes longer than `CLOSING`."""
         if self._descriptor >= 0:
-            if not self._driven:
-                self.child.nudge(END)
+            self.dismiss()
             self.killed = not self.child.close(CLOSING)
             self._calls.close()
             os.close(self._descriptor)

@@ -12,7 +12,7 @@ import queue
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -57,15 +57,17 @@ class Recorder(Observer):
         new = not self.path.exists()
         self._file = self.path.open("wb")
         self.ticks = self.dropped = 0
-        """Ticks written, and records that found the queue full or could not be encoded."""
+        """Ticks in the file, and records that are not: the queue or the disk was full, or they could not be encoded."""
         self.error: str | None = None
         """Why the recording ended early."""
         self._queue: queue.SimpleQueue[TickRecord | Event | threading.Event | None] = queue.SimpleQueue()
         self._encoder = messages.TickEncoder()
         self._unreadable = False
+        self._added = self._unwritten = 0
+        """Ticks that the writer has been given, and records of those that are in no chunk of the file yet."""
         self._writer = Writer(self._file)
         try:
-            self._indices = _ChunkIndices(self.path.parent)
+            self._indices = _ChunkIndices(self.path.parent, self._chunk_written)
             setattr(self._writer, _CHUNK_INDICES, self._indices)
             self._writer.start(profile=PROFILE, library="hiernav")
             self._writer.add_metadata(ABOUT, dict(about or {}))
@@ -92,7 +94,7 @@ class Recorder(Observer):
         if self.error is None and not written.wait(timeout):
             log.warning("%s: not all of the recording could be written within %g s", self.path, timeout)
 
-    def close(self, timeout: float = 5.0) -> None:
+    def close(self, timeout: float = 3.0) -> None:
         """Write what waits, at most `timeout` [s] long, and finish the file. May be called again."""
         self._queue.put(None)
         self._thread.join(timeout)
@@ -124,8 +126,9 @@ class Recorder(Observer):
         try:
             self._write_all()
         except Exception as error:
-            self.error = str(error) or type(error).__name__
+            self.error = getattr(error, "strerror", None) or str(error) or type(error).__name__
             log.error("%s: the recording ends here, the robot drives on: %s", self.path, self.error)
+            self.dropped += self._unwritten
             # what the buffer still holds cannot be written either
             try:
                 self._file.close()
@@ -133,6 +136,11 @@ class Recorder(Observer):
                 pass
         self._indices.close()
         self._release_waiting()
+
+    def _chunk_written(self) -> None:
+        """The writer has finished a chunk: what it was given until now is in the file."""
+        self._file.flush()
+        self.ticks, self._unwritten = self._added, 0
 
     def _write_all(self) -> None:
         time_ns, chunk_begun = 0, time.monotonic()
@@ -143,18 +151,25 @@ class Recorder(Observer):
                 item = threading.Event()
             if item is None:
                 break
+            if not isinstance(item, threading.Event):
+                time_ns = max(time_ns, self._time_ns(item))
+                self._add(item, time_ns)
             if isinstance(item, threading.Event) or time.monotonic() - chunk_begun >= CHUNK_SECONDS:
-                self._writer.flush()
+                try:
+                    self._writer.flush()
+                finally:
+                    if isinstance(item, threading.Event):
+                        item.set()
                 chunk_begun = time.monotonic()
-            if isinstance(item, threading.Event):
-                item.set()
-                continue
-            time_ns = max(time_ns, self._time_ns(item))
-            for topic, data in self._encoded(item):
-                self._writer.add_message(self._channels[topic], time_ns, data, time_ns, self.ticks)
-                self.ticks += topic == "/tick"
         self._writer.finish()
         self._file.close()
+
+    def _add(self, item: TickRecord | Event, time_ns: int) -> None:
+        for topic, data in self._encoded(item):
+            number = self._added
+            self._added += topic == "/tick"
+            self._unwritten += topic in ("/tick", "/event")  # the last message of a record
+            self._writer.add_message(self._channels[topic], time_ns, data, time_ns, number)
 
     def _encoded(self, item: TickRecord | Event) -> list[tuple[str, bytes]]:
         """The item's messages; none if there is something in it that cannot be recorded."""
@@ -181,15 +196,20 @@ class Recorder(Observer):
                 return
             if isinstance(item, threading.Event):
                 item.set()
+            elif item is not None:
+                self.dropped += 1
 
 
 class _ChunkIndices:
     """In the place of a list of the file's chunks: keeps them in a file of its own, which has no name."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, chunk_written: Callable[[], None]) -> None:
+        """`chunk_written` is called after each of them."""
         self._file = tempfile.TemporaryFile(buffering=0, dir=folder)
+        self._chunk_written = chunk_written
 
     def append(self, index: ChunkIndex) -> None:
+        self._chunk_written()
         record = RecordBuilder()
         index.write(record)
         self._file.write(record.end())

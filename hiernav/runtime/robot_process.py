@@ -28,6 +28,7 @@ import numpy as np
 from hiernav.runtime.child import leave_signals_to_parent, wait_for_news
 from hiernav.runtime.gathering import Gathering
 from hiernav.runtime.mailbox import Mailbox, mapped
+from hiernav.runtime.patient import be_patient
 from hiernav.runtime.realtime import RealtimeConfig, request_realtime
 from hiernav.runtime.robot import CommandWatchdog, Robot, SensorFrame
 from hiernav.runtime.wire import CAPACITY, decode_command, encode_frame
@@ -53,6 +54,7 @@ LAST_BRAKES = 1.0
 def main() -> None:
     news, calls, descriptor = map(int, sys.argv[1:4])
     leave_signals_to_parent()
+    be_patient(reports=False)  # what the robot's code prints must not keep it from braking
     settings = json.loads(sys.argv[4])
     try:
         robot = make_robot(settings["robot"], settings["arguments"])
@@ -61,16 +63,16 @@ def main() -> None:
     except BaseException as error:
         if _frames(error):
             _tell([error])
-        with suppress(OSError):
-            os.write(calls, _refusal(f"adapter {settings['robot']!r}: {_one_line(error)}"))
+        _say(calls, {"error": f"adapter {settings['robot']!r}: {_one_line(error)}"})
         _leave(1)
     _leave(adapter.run())
 
 
 def _leave(status: int) -> NoReturn:
     """End at once: threads that the robot's code has started, and never ended, must not keep this process."""
-    with suppress(Exception):
-        sys.stdout.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):
+            stream.flush()
     os._exit(status)
 
 
@@ -147,7 +149,8 @@ class Adapter:
         failures += self._brake_for(last_brakes)  # before anything else
         if failures:  # one that was never introduced still owes its first answer
             why = _one_line(failures[0])
-            self._answer({"gone": why} if self._introduced else {"error": f"the robot's adapter cannot start: {why}"})
+            answer = {"gone": why} if self._introduced else {"error": f"the robot's adapter cannot start: {why}"}
+            _say(self._calls, answer)
         try:
             self.robot.close()
         except BaseException as error:
@@ -162,7 +165,7 @@ class Adapter:
         period, action_dim = float(robot.control_period), int(robot.action_dim)
         facts = {"control_period": period, "action_dim": action_dim, "realtime": granted}
         self._publish()
-        if not self._answer(facts):
+        if not _say(self._calls, facts):
             return False
         self._introduced = True
         while True:
@@ -266,19 +269,16 @@ class Adapter:
         self._shown = self._fix = None
         self._gathering.forget()
         self._publish()
-        return self._answer(answer)
-
-    def _answer(self, answer: dict[str, Any]) -> bool:
-        """False if nobody is there any more who could take it."""
-        try:
-            os.write(self._calls, json.dumps(answer).encode() + b"\n")
-        except OSError:
-            return False
-        return True
+        return _say(self._calls, answer)
 
 
-def _refusal(why: str) -> bytes:
-    return json.dumps({"error": why}).encode() + b"\n"
+def _say(calls: int, answer: dict[str, Any]) -> bool:
+    """Tell the control process in a line of JSON; False if nobody is there any more who could take it."""
+    try:
+        os.write(calls, json.dumps(answer).encode() + b"\n")
+    except OSError:
+        return False
+    return True
 
 
 def _one_line(error: BaseException) -> str:

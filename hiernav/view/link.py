@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Protocol
@@ -22,6 +23,7 @@ import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime import messages
+from hiernav.runtime.child import DYING
 from hiernav.runtime.observe import Event, Observer, TickRecord
 from hiernav.view.commands import COMMAND_BYTES, MAX_BYTES, Command, Settings
 
@@ -33,8 +35,8 @@ PAGE_BUFFER, HEARD_PER_TICK = 65536, 256
 """What the page's end of the socket holds [bytes], and messages that are read in a tick at most: more than that."""
 LARGEST_MAP = 1_000_000
 """Pixels of a map that is shown as it is; a larger one is shown coarser."""
-START_SECONDS = 30.0
-"""What the page's process is given to come up, before the robot moves [s]."""
+START_SECONDS, CLOSING = 30.0, 1.0
+"""What the page's process is given to come up, before the robot moves, and to end by itself [s]."""
 
 PROGRAM = (sys.executable, "-m", "hiernav.view")
 
@@ -154,10 +156,11 @@ class ViewerLink(Observer):
             self._socket.close()
             self._socket = None
         try:
-            self._process.wait(3.0)
+            self._process.wait(CLOSING)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(DYING)
 
     def _start(self, settings: Settings) -> str:
         assert self._socket is not None

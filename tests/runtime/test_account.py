@@ -220,6 +220,9 @@ class Remote(SimRobot):
     realtime: dict[str, str] = {}
     killed = False
 
+    def dismiss(self) -> None:
+        pass
+
 
 @pytest.fixture
 def serve(run, tmp_path, monkeypatch) -> Callable[..., tuple[int, dict[str, Any]]]:

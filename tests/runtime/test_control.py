@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
+import tempfile
 import threading
 import time
 from collections import deque
@@ -348,6 +350,14 @@ def test_where_nothing_listens_that_is_said(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match="there is something else"):
         ControlServer(driver_of(), tmp_path / "file")
+
+
+def test_a_loop_is_found_where_no_temporary_file_can_be_made(monkeypatch, tmp_path):
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "_get_default_tempdir", lambda *_: "/somewhere/else")
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    assert control.default_socket() == tmp_path / f"hiernav-{os.getuid()}" / "hiernav-control.sock"
 
 
 def test_a_goal_must_be_finite():

@@ -20,6 +20,14 @@ anything = st.floats(allow_nan=True, allow_infinity=True)
 actions = st.lists(anything, min_size=3, max_size=3).map(np.array)
 
 
+@pytest.mark.parametrize(
+    ("own", "bundle", "both"),
+    [(0.3, 0.2, 0.2), (0.1, 0.2, 0.1), (None, 0.2, 0.2), (0.3, None, 0.3), (None, None, None)],
+)
+def test_of_two_slew_limits_the_lower_one_holds(own, bundle, both):
+    assert GuardConfig(slew_limit=own, tilt_limit=1.0).limited(bundle) == GuardConfig(slew_limit=both, tilt_limit=1.0)
+
+
 @given(st.lists(st.tuples(actions, st.one_of(st.none(), anything)), max_size=40), st.booleans())
 def test_whatever_comes_in_what_goes_out_is_finite_and_within_limits(sequence, slewed):
     config = GuardConfig(slew_limit=0.2 if slewed else None, tilt_limit=1.0)

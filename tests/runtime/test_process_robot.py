@@ -10,6 +10,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -275,6 +276,61 @@ def test_a_thread_that_the_robots_driver_leaves_running_keeps_no_process(tmp_pat
     assert not robot.killed and log.read_text().split()[-2] == "close"
     said = capfd.readouterr()
     assert said.out == "" and "connected" in said.err  # the standard output is this process's own
+
+
+PRINTING = """
+import sys
+sys.path.insert(0, {folder!r})
+import scripted_robot
+
+class Robot(scripted_robot.ScriptedRobot):
+    def read(self):
+        print("reading " * 20, flush=True)
+        return super().read()
+
+make = Robot
+"""
+
+
+@pytest.mark.parametrize("fails", ["", "read"])
+def test_a_robot_whose_messages_nobody_reads_is_braked_and_released_and_its_adapter_ends(tmp_path, monkeypatch, fails):
+    file, log = tmp_path / "printing.py", tmp_path / "log"
+    file.write_text(PRINTING.format(folder=str(Path(__file__).parent)))
+    monkeypatch.setattr(process_robot, "CLOSING", 20.0)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x")
+    os.set_blocking(writer, True)
+    before = os.dup(2)
+    os.dup2(writer, 2)
+    try:
+        robot = ProcessRobot(f"{file}:make", {"path": str(log), "fails": fails, "good": 3})
+        with pytest.raises(RobotGone) if fails else nullcontext():
+            first = robot.read().stamp
+            while robot.read().stamp < first + 0.1 or fails:
+                time.sleep(0.005)
+        robot.close()
+    finally:
+        os.dup2(before, 2)
+        for each in (before, reader, writer):
+            os.close(each)
+    assert not robot.killed and robot.child.ended == (1 if fails else 0)
+    assert [line.split()[0] for line in log.read_text().splitlines()][-2:] == ["brake", "close"]
+
+
+def test_an_adapter_that_was_dismissed_has_no_more_time_to_end_than_since_then(tmp_path, monkeypatch):
+    monkeypatch.setattr(process_robot, "CLOSING", 2.0)
+    robot, waits = ProcessRobot(SCRIPTED, {"path": str(tmp_path / "log")}), []
+    robot.read()
+    os.kill(robot.child.process.pid, signal.SIGSTOP)
+    wait = robot.child.process.wait
+    monkeypatch.setattr(robot.child.process, "wait", lambda timeout: (waits.append(timeout), wait(timeout))[1])
+    robot.dismiss()
+    time.sleep(0.5)
+    robot.close()
+    assert robot.killed and waits[0] <= 1.5
 
 
 def test_an_adapter_that_does_not_end_is_killed_and_that_is_known(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import resource
 from pathlib import Path
 
@@ -45,3 +46,15 @@ def test_a_disk_that_fills_up_ends_the_recording_and_the_robot_arrives(tmp_path,
     assert recorder.summary()["error"] == recorder.error
     log = RunLog(recorder.path)
     assert len(list(log.ticks())) == whole and not log.complete
+    assert recorder.summary()["ticks"] == whole, "those that are in the file, and no others"
+    told = [*memory.records, *memory.events, *full.records, *full.events]
+    assert len(list(log)) + recorder.dropped == len(told)
+
+
+def test_nobody_waits_for_a_disk_that_has_failed(tmp_path, monkeypatch, caplog):
+    recorder, full = Recorder(tmp_path / "run.mcap"), OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(recorder._writer, "flush", lambda: (_ for _ in ()).throw(full))
+    recorder.flush(10.0)
+    recorder.close()
+    assert recorder.error == "No space left on device"
+    assert not [each for each in caplog.messages if "could be written within" in each]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import configparser
 import fcntl
+import inspect
 import json
 import os
 import signal
@@ -11,13 +13,20 @@ import sys
 import termios
 import textwrap
 import time
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 from scripted_robot import write_adapter
 from shipped import RUN_LOOP
 
+from hiernav.drive.episodes import Episodes
+from hiernav.drive.exits import OK
+from hiernav.runtime import driver, patient, process_robot
 from hiernav.runtime.control import tell
+from hiernav.runtime.driver_config import DriverConfig
+from hiernav.runtime.recorder import Recorder
+from hiernav.view import link
 
 PROGRAM = textwrap.dedent(
     """
@@ -150,6 +159,36 @@ def test_a_terminal_that_is_closed_ends_the_command_line_as_well_and_costs_no_su
     os.close(ours)
     assert process.wait(60) == 0
     assert json.loads((out / "summary.json").read_text())["episodes"] == []
+
+
+def test_the_processes_end_while_the_recording_is_finished_and_the_account_is_given(monkeypatch):
+    done = []
+
+    class Part:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def dismiss(self) -> None:
+            done.append(self.name)
+
+        close = dismiss
+
+    episodes = object.__new__(Episodes)
+    episodes.remote, episodes.link, episodes.recorder = Part("adapter"), Part("planner"), Part("recorder")
+    episodes.page, episodes.arguments = Part("page"), Namespace(no_pictures=True)
+    monkeypatch.setattr(Episodes, "_finish", lambda self, drives: done.append("account") or OK)
+    assert episodes._account_for(lambda drives: done.append("loop")) == OK
+    assert done == ["loop", "adapter", "planner", "recorder", "account", "page"]
+
+
+def test_what_is_waited_for_where_everything_hangs_fits_into_what_the_service_manager_gives():
+    """One after another: observers, a complaint, the stop; then the adapter, beside recorder, screen and page."""
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.read(RUN_LOOP.with_name("hiernav.service"))
+    recording = inspect.signature(Recorder.close).parameters["timeout"].default
+    beside = max(process_robot.CLOSING, recording + patient.PATIENCE + link.CLOSING)
+    waits = driver.FLUSH_SECONDS + patient.BRIEFLY + DriverConfig().stop_timeout + beside
+    assert waits <= unit.getfloat("Service", "TimeoutStopSec") - 0.5
 
 
 def descendants(pid: int) -> list[int]:
