@@ -18,6 +18,7 @@ import json
 import math
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -205,6 +206,7 @@ class Run:
             if self._writer is None:
                 from torch.utils.tensorboard import SummaryWriter
 
+                _spare_writer_tracebacks()
                 self._writer = SummaryWriter(str(self.path / "tensorboard"), purge_step=purge_step)
             for key, value in known.items():
                 if value is not None:
@@ -278,6 +280,24 @@ def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None])
         raise RunError(f"{path} cannot be written to ({cause.strerror or cause}): there is no run yet") from cause
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+_spared = False
+
+
+def _spare_writer_tracebacks() -> None:
+    """TensorBoard's thread keeps its OSError for whoever gives it the next value: once is enough to be told of it."""
+    global _spared
+    if _spared:
+        return
+    usual, _spared = threading.excepthook, True
+
+    def tell(failure: threading.ExceptHookArgs) -> None:
+        of_tensorboard = type(failure.thread).__module__.partition(".")[0] == "tensorboard"
+        if not (of_tensorboard and issubclass(failure.exc_type, OSError)):
+            usual(failure)
+
+    threading.excepthook = tell
 
 
 def spent_seconds(folder: Path, stage: str) -> float:

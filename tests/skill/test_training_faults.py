@@ -151,6 +151,34 @@ def test_a_full_disk_ends_training_in_one_line_and_leaves_the_last_checkpoint(
     assert rates == [256, 512, 768]
 
 
+def test_a_disk_that_is_too_full_for_tensorboard_is_told_of_once(tmp_path):
+    program = f"""
+import resource, threading, time
+import numpy as np
+from hiernav.config import load_config
+from hiernav.run import Run, RunError
+run = Run.create(load_config(None, ["run_dir={tmp_path / "run"}"]))
+run.log("skill", 0, {{"reach_rate": 0.0}})
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, hard))  # more than the configuration, less than the curves
+try:
+    for step in range(1, 20):
+        run._writer.add_histogram("much", np.arange(1000.0), step)
+        run._writer.file_writer.flush()
+        time.sleep(0.1)
+        run.log("skill", step, {{"reach_rate": 0.0}})
+except (RunError, OSError) as error:
+    print(type(error).__name__)
+    thread = threading.Thread(target=lambda: 1 / 0)
+    thread.start()
+    thread.join()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and done.stdout.split() in (["OSError"], ["RunError"])
+    assert "File too large" not in done.stderr and done.stderr.count("Traceback") == 1
+    assert "ZeroDivisionError" in done.stderr  # of other threads all is told
+
+
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="this system cannot set space aside")
 def test_the_replay_takes_its_place_on_disk_before_training_begins(tmp_path):
     replay = replay_module.Replay(tmp_path / "replay", 5_000, 42, 2, 8)
