@@ -65,3 +65,11 @@ class Rehearsal:
         x, y, _ = estimate.pose.tolist()
         ttc = time_to_collision(occupancy, (x, y), (1.0, 0.0), self._radius, 0.5)
         self._guard.check(decision.action, estimate.upright, ttc, velocity=estimate.body_velocity())
+
+
+def warm_up(config: EstimatorConfig) -> None:
+    """Have the linear algebra make its buffers now: with locked memory the first call takes up to 0.2 s."""
+    scratch = Estimator(config)
+    for stamp in (0.0, 0.01):
+        field, still = np.array(config.magnetic_field), np.zeros(3)
+        scratch.update(SensorFrame(stamp, still, still, field, still, position_fix=np.zeros(2)))

@@ -8,6 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hiernav.runtime.watchdogs import BlockedWatch, SaturationWatch
+
+Counts = tuple[Counter[str], Counter[str], Counter[str]]
+"""What guard, estimator and planner have counted, each by kind."""
+
 
 @dataclass
 class Trip:
@@ -16,8 +21,10 @@ class Trip:
     goal: np.ndarray
     """(2,) world frame [m]."""
     max_steps: int
-    before: tuple[Counter[str], Counter[str], Counter[str]]
-    """What guard, estimator and planner had counted when it began."""
+    before: Counts
+    """When it began."""
+    no_way: BlockedWatch
+    saturation: SaturationWatch
     steps: int = 0
     """Control steps driven."""
     began: float | None = None
@@ -33,12 +40,33 @@ class Trip:
     holds: Counter[str] = field(default_factory=Counter)
     """How often it had to wait, by cause."""
     recoveries: int = 0
+    saturated: int = 0
+    """How often it was helped with an action that stayed saturated."""
     replans: Counter[str] = field(default_factory=Counter)
 
     @property
     def seconds(self) -> float:
         """Time it has taken on the robot's clock [s]."""
         return 0.0 if self.began is None else self.last - self.began
+
+    def result(self, stopped: bool, fault: str | None, counts: Counts) -> RunResult:
+        """How it ended, with what has been counted by now."""
+        guard, estimator, planner = (dict(now - before) for now, before in zip(counts, self.before, strict=True))
+        return RunResult(
+            reason=self.reason or "interrupted",
+            steps=self.steps,
+            seconds=self.seconds,
+            distance=self.distance,
+            stopped=stopped,
+            fault=fault,
+            detail=self.detail,
+            replans=dict(self.replans),
+            guard=guard,
+            estimator=estimator,
+            holds=dict(self.holds),
+            recoveries=self.recoveries,
+            planner=planner,
+        )
 
 
 @dataclass(frozen=True)

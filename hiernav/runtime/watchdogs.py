@@ -8,6 +8,7 @@ from collections import deque
 import numpy as np
 
 from hiernav.runtime.estimate import Estimate, Trust
+from hiernav.runtime.estimator import Estimator
 
 
 class BlindWatch:
@@ -221,3 +222,10 @@ class StopWatch:
         if slow is not self._slow or not estimate.stamp >= self._stamp:
             self._slow, self._alike, self._since_stamp = slow, 0, estimate.stamp
         self._alike, self._stamp = self._alike + 1, estimate.stamp
+
+
+def measured(estimator: Estimator) -> tuple[bool, bool, bool]:
+    """What `StopWatch.check` asks of the sensors behind an estimate: `measured`, `turn_measured` and `sure`."""
+    patience = estimator.config.hold_after
+    speed, turn = (estimator.silence(name) < patience for name in ("velocimeter", "gyro"))
+    return speed, turn, estimator.hears("velocimeter") and estimator.hears("gyro")
