@@ -5,8 +5,12 @@ Normalisation and action scaling are inside the graphs: they take raw observatio
 
 from __future__ import annotations
 
+import logging
 import math
 import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -208,18 +212,33 @@ def _export(
     module: nn.Module, inputs: tuple[np.ndarray, ...], names: tuple[str, ...], outputs: tuple[str, ...], file: Path
 ) -> None:
     batch = torch.export.Dim("batch", min=1, max=65536)
-    torch.onnx.export(
-        module,
-        tuple(torch.from_numpy(value) for value in inputs),
-        str(file),
-        input_names=list(names),
-        output_names=list(outputs),
-        dynamic_shapes=tuple({0: batch} for _ in inputs),
-        opset_version=OPSET,
-        external_data=False,
-        dynamo=True,
-        verbose=False,
-    )
+    with _only_errors():
+        torch.onnx.export(
+            module,
+            tuple(torch.from_numpy(value) for value in inputs),
+            str(file),
+            input_names=list(names),
+            output_names=list(outputs),
+            dynamic_shapes=tuple({0: batch} for _ in inputs),
+            opset_version=OPSET,
+            external_data=False,
+            dynamo=True,
+            verbose=False,
+        )
+
+
+@contextmanager
+def _only_errors() -> Iterator[None]:
+    """Without what the exporter says of packages that are not needed here, and of its own insides."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
 
 
 def _spec(name: str, golden: dict[str, np.ndarray]) -> TensorSpec:

@@ -32,6 +32,9 @@ CLIENTS = 32
 """Clients that may be at their line at the same time; the one after them takes the place of the first."""
 COMMANDS = ("goal X,Y", "cancel", "pause", "resume", "stop", "acknowledge", "status", "quit")
 
+LONGEST_PATH = 107
+"""Of a socket [bytes]; the system's."""
+
 log = logging.getLogger(__name__)
 
 
@@ -134,6 +137,7 @@ class ControlServer:
             ValueError: the folder belongs to somebody else, or a loop that lives listens there.
         """
         self.driver, self.path = driver, path
+        _require_short(path)
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if path.parent.stat().st_uid != os.getuid():
             raise ValueError(f"control socket {path}: the folder belongs to another user")
@@ -265,6 +269,7 @@ def tell(path: Path, command: str) -> dict[str, Any]:
     Raises:
         ValueError: nothing listens there.
     """
+    _require_short(path)
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(2.0 * PATIENCE)
@@ -275,6 +280,12 @@ def tell(path: Path, command: str) -> dict[str, Any]:
                 return json.loads(answer.readline())
     except (OSError, json.JSONDecodeError) as error:
         raise ValueError(f"no loop answers at {path}: {error}") from None
+
+
+def _require_short(path: Path) -> None:
+    size = len(os.fsencode(path))
+    if size > LONGEST_PATH:
+        raise ValueError(f"control socket {path}: a path of {size} bytes, expected at most {LONGEST_PATH}")
 
 
 def _connect(client: socket.socket, path: Path, patience: float) -> None:

@@ -50,6 +50,7 @@ class Page:
         self._last: tuple[int, float] | None = None
         self._rate = 0.0
         self._shown = 0
+        self._began: float | None = None
         self._events: deque[str] = deque(maxlen=12)
         self._make_scene()
         self._make_panel()
@@ -78,8 +79,9 @@ class Page:
         self._shown += 1
 
     def tell(self, event: Event) -> None:
-        """Note an event in the panel."""
-        self._events.append(f"{event.time:.1f} s: {event.kind} {event.text}")
+        """Note an event in the panel, by the time since the first one."""
+        self._began = event.time if self._began is None else self._began
+        self._events.append(f"{event.time - self._began:.1f} s: {event.kind} {event.text}")
         self._log.content = "\n".join(f"- {_plain(line)}" for line in reversed(self._events))
         if event.kind == "mode" and event.values.get("mode") in ("init", "armed"):
             self._trail.clear()

@@ -309,6 +309,16 @@ def test_only_this_user_may_connect_and_two_loops_do_not_share_a_socket(serving)
         ControlServer(driver, path)
 
 
+def test_a_path_that_no_socket_can_have_is_refused_with_the_limit(tmp_path):
+    path = tmp_path / ("s" * (107 - len(os.fsencode(tmp_path)) - 1))
+    with ControlServer(driver_of(), path):
+        pass
+    longer = path.with_name(path.name + "s")
+    for what in (lambda: ControlServer(driver_of(), longer), lambda: tell(longer, "status")):
+        with pytest.raises(ValueError, match="a path of 108 bytes, expected at most 107"):
+            what()
+
+
 def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(control.os, "getuid", lambda: tmp_path.stat().st_uid + 1)
     with pytest.raises(ValueError, match="the folder belongs to another user"):

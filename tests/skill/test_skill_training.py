@@ -112,6 +112,8 @@ def test_a_run_does_all_its_steps_evaluates_and_logs(straight):
 def test_reasons_for_new_plans_are_logged_but_for_those_that_an_episode_begins_with(straight):
     logged = [key for key in metrics_of(straight.run.path)[0] if key.startswith("replans/")]
     assert logged == [f"replans/{reason}" for reason in ("d_update", "half_index", "invalid", "goal", "outdated")]
+    shares = [[line[key] for key in logged] for line in metrics_of(straight.run.path) if logged[0] in line]
+    assert all(0.0 <= share < 1.0 for line in shares for share in line) and any(sum(line) > 0.0 for line in shares)
 
 
 def test_many_simulations_make_segments_longer_than_checkpoints_were_asked_for(tmp_path):
