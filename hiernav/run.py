@@ -14,6 +14,7 @@ run leaves the same files as an uninterrupted one. Checkpoints, and what they sp
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -282,15 +283,10 @@ def _create_begun(path: Path, config: TrainConfig, begin: Callable[[Run], None])
         shutil.rmtree(beside, ignore_errors=True)
 
 
-_spared = False
-
-
+@functools.cache
 def _spare_writer_tracebacks() -> None:
     """TensorBoard's thread keeps its OSError for whoever gives it the next value: once is enough to be told of it."""
-    global _spared
-    if _spared:
-        return
-    usual, _spared = threading.excepthook, True
+    usual = threading.excepthook
 
     def tell(failure: threading.ExceptHookArgs) -> None:
         of_tensorboard = type(failure.thread).__module__.partition(".")[0] == "tensorboard"

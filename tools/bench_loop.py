@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=number_from(1.0), default=60.0, help="of that run (60)")
     parser.add_argument("--hogs", type=whole(0), default=0, help="processes that compute beside that run (0)")
     parser.add_argument(
-        "--host", action="store_true", help="that run without hiernav's tick: the limit of this machine"
+        "--host", action="store_true", help="that run without hiernav: what this machine leaves of a loop"
     )
     parser.add_argument("--bundle", type=Path, default=Path("deploy/bundles/point"), help="of the point robot")
     parser.add_argument(
@@ -185,8 +185,8 @@ def measure(
 def measure_host(rate: int, seconds: float, hogs: int, normal: bool) -> dict[str, Any]:
     """The same loop and settings with a tick of fixed arithmetic, and no process beside it but the hogs.
 
-    What is missed here, no program on this machine can keep: `tick` is `warm` (`HOST_WORK` or a little more, measured
-    without pauses) and what the machine adds to it.
+    What it misses, no loop that computes as much can keep on this machine: `tick` is `warm` (`HOST_WORK` or a little
+    more, measured without pauses) and what the machine adds to it.
     """
     from hiernav.runtime.clock import MonotonicClock
     from hiernav.runtime.loop import FixedRateLoop

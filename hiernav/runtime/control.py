@@ -134,7 +134,8 @@ class ControlServer:
             path: of the socket; only this user may connect. What a dead loop left there is replaced.
 
         Raises:
-            ValueError: the folder belongs to somebody else, or a loop that lives listens there.
+            ValueError: the path is too long for a socket, the folder belongs to somebody else, or a loop that lives
+                listens there.
         """
         self.driver, self.path = driver, path
         _require_short(path)
@@ -267,7 +268,7 @@ def tell(path: Path, command: str) -> dict[str, Any]:
     """Send a command to the loop that listens at `path`; its answer.
 
     Raises:
-        ValueError: nothing listens there.
+        ValueError: nothing listens there, or no socket can have this path.
     """
     _require_short(path)
     try:
