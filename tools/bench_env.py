@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -103,8 +104,7 @@ class Bare:
         self.task, self._turn, self._model = task, 0, task.sim.model
         self._datas = [mujoco.MjData(self._model) for _ in range(ROWS)]
         self._actions = np.random.default_rng(0).uniform(-1.0, 1.0, (64, ROWS, task.robot.action_dim))
-        self._chunks = np.array_split(np.arange(ROWS), threads)
-        self._pool = ThreadPoolExecutor(threads)
+        self._threads, self._pool = threads, ThreadPoolExecutor(threads)
 
     def run(self, seconds: float) -> tuple[int, float]:
         for data, source in zip(self._datas, self.task.sim.datas, strict=True):
@@ -113,14 +113,15 @@ class Bare:
 
     def _step(self) -> int:
         self._turn += 1
-        if len(self._chunks) == 1:
-            self._step_rows(self._chunks[0])
+        rows = iter(range(ROWS))
+        if self._threads == 1:
+            self._step_rows(rows)
         else:
-            list(self._pool.map(self._step_rows, self._chunks))
+            list(self._pool.map(self._step_rows, [rows] * self._threads))  # each takes the next row when done with one
         return ROWS
 
-    def _step_rows(self, rows: np.ndarray) -> None:
+    def _step_rows(self, rows: Iterator[int]) -> None:
         actions = self._actions[self._turn % 64]
-        for row in rows.tolist():
+        for row in rows:
             self._datas[row].ctrl[:] = actions[row]
             mujoco.mj_step(self._model, self._datas[row], nstep=self.task.robot.substeps)

@@ -6,7 +6,7 @@ MuJoCo releases the interpreter lock meanwhile, so that threads step their share
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -69,8 +69,8 @@ class BatchSim:
             name: slice(self.model.sensor(name).adr[0], self.model.sensor(name).adr[0] + 3) for name in BASE_SENSORS
         }
         self._contact_columns = [_history_values(self.model, name) for name in CONTACT_SENSORS]
-        self._chunks = [chunk.tolist() for chunk in np.array_split(np.arange(num_envs), min(threads, num_envs))]
-        self._workers = ThreadPoolExecutor(len(self._chunks) - 1, "batch-sim") if len(self._chunks) > 1 else None
+        self._helpers = min(threads, num_envs) - 1
+        self._workers = ThreadPoolExecutor(self._helpers, "batch-sim") if self._helpers else None
         self.collided = np.zeros(num_envs, bool)
         for data in self.datas:
             mujoco.mj_forward(self.model, data)
@@ -119,13 +119,11 @@ class BatchSim:
         for row, layout in self._gremlins.items():
             data = self.datas[row]
             self._pool.move_gremlins(layout, data.time, data.mocap_pos)
-        if self._workers is None:
-            self._step_rows(self._chunks[0])
-        else:
-            futures = [self._workers.submit(self._step_rows, chunk) for chunk in self._chunks[1:]]
-            self._step_rows(self._chunks[0])
-            for future in futures:
-                future.result()
+        rows = iter(range(self.num_envs))  # of all threads: each takes the next row when it is done with one
+        futures = [self._workers.submit(self._step_rows, rows) for _ in range(self._helpers)] if self._workers else []
+        self._step_rows(rows)
+        for future in futures:
+            future.result()
         history = self._publish()
         total, floor, own = (history[:, columns] for columns in self._contact_columns)
         self.collided = (total > floor + own).any(axis=1) & self.finite
@@ -139,7 +137,7 @@ class BatchSim:
         if self._workers is not None:
             self._workers.shutdown()
 
-    def _step_rows(self, rows: Sequence[int]) -> None:
+    def _step_rows(self, rows: Iterator[int]) -> None:
         model, substeps, controls, finite = self.model, self.robot.substeps, self._controls, self.finite
         for row in rows:
             if finite[row]:
