@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
+
+# Before ONNX Runtime is imported: since 1.29 it would keep a database on disk, and upload from threads of its own.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime as ort
 
 from hiernav.nav import goselo
