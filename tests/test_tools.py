@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -44,7 +42,6 @@ def test_bad_input_is_one_line(command, line):
     [
         (["bench.py", "--seconds", "nan"], "bench.py: error: argument --seconds: nan, it must be finite and above 0"),
         (["planner_scale.py", "--worlds", "0"], "planner_scale.py: error: argument --worlds: 0, it must be at least 1"),
-        (["planner_table.py", "--seeds", "-1"], "planner_table.py: error: argument --seeds: -1, it must be at least 0"),
         (["noise_table.py", "--workers", "0"], "noise_table.py: error: argument --workers: 0, it must be at least 1"),
         (
             ["training_race.py", "--reach", "7"],
@@ -79,30 +76,6 @@ def tool(name: str):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.mark.parametrize(
-    ("options", "there"),
-    [
-        (["--world", "two-room"], "world pillar(2,2,10)"),
-        (["--episodes", "40"], "episodes 1000"),
-        (["--robot", "car"], "robot point"),
-        (["--set", "planner.epochs=3"], "settings []"),
-    ],
-)
-def test_a_table_of_planners_holds_results_of_one_kind(tmp_path, monkeypatch, capsys, options, there):
-    planner_table = tool("planner_table")
-    entry = {
-        "samples": 1000, "preset": "paper", "seed": 0, "world": "pillar(2,2,10)", "robot": "point", "episodes": 1000,
-        "settings": [], "collisions_mean": 3.0, "reach_rate": 1.0,
-    }  # fmt: skip
-    (tmp_path / "table.json").write_text(json.dumps({"paper-1000-0": entry}))
-    command = ["planner_table.py", "--out", str(tmp_path), "--only-print"]
-    monkeypatch.setattr(sys, "argv", command)
-    assert planner_table.main() == 0 and "3.000 (1)" in capsys.readouterr().out
-    monkeypatch.setattr(sys, "argv", [*command, *options])
-    with pytest.raises(ValueError, match=re.escape(f"paper-1000-0 is of {there}; choose another --out")):
-        planner_table.main()
 
 
 @pytest.mark.train
