@@ -37,11 +37,11 @@ def layout_of(world: WorldSpec, seed: int, spec: RobotSpec, goal: np.ndarray | N
         )
     if not occupancy.is_free(goal, spec.radius):
         raise GoalError(
-            f"--goal {goal[0]:g},{goal[1]:g} is less than {spec.radius:g} m from an obstacle in seed {seed}: "
+            f"--goal {goal[0]:g},{goal[1]:g} is less than {spec.radius:g} m from an obstacle in {world}, seed {seed}: "
             "choose a free place (hiernav world --png draws the world)"
         )
     if start_known and not is_solvable(occupancy, layout.start[:2], goal, spec.radius):
-        raise GoalError(f"--goal {goal[0]:g},{goal[1]:g} cannot be reached from the start in seed {seed}")
+        raise GoalError(f"--goal {goal[0]:g},{goal[1]:g} cannot be reached from the start in {world}, seed {seed}")
     return replace(layout, goal=goal)
 
 
