@@ -7,6 +7,7 @@ import gc
 import math
 import os
 import resource
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ MCL_CURRENT = 1
 MCL_FUTURE = 2
 MCL_ONFAULT = 4
 CAP_IPC_LOCK = 14
+WAKE_LATENCY = "/dev/cpu_dma_latency"
+"""Takes the longest time in which a processor may wake, an int32 [us], for as long as it is held open."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,9 @@ class RealtimeConfig:
     """Keep all pages in memory (mlockall)."""
     cpus: tuple[int, ...] | None = None
     """CPUs that the control process and the robot's adapter may run on; None leaves the choice to the system."""
+    wake_latency_us: int | None = 10
+    """Processors must be able to wake within this time [us], which keeps them from their deepest sleep and costs power
+    while the process lives; None lets them sleep."""
     rehearsal: float = 0.0025
     """Time before each tick from which on one is rehearsed, so that the caches are warm [s]; 0 for none."""
     freeze_gc: bool = True
@@ -40,6 +46,10 @@ class RealtimeConfig:
             raise ValueError(f"RealtimeConfig.rehearsal = {self.rehearsal} s must be finite and not negative")
         if self.timer_slack_ns < 0:
             raise ValueError(f"RealtimeConfig.timer_slack_ns = {self.timer_slack_ns} ns must not be negative")
+        if self.wake_latency_us is not None and not 0 <= self.wake_latency_us < 2**31:
+            raise ValueError(
+                f"RealtimeConfig.wake_latency_us = {self.wake_latency_us} us must not be negative nor beyond 2147483647"
+            )
         if self.fifo_priority is not None and not 1 <= self.fifo_priority <= 99:
             raise ValueError(f"RealtimeConfig.fifo_priority = {self.fifo_priority} must be 1 to 99, or null")
         if self.cpus is not None and (not self.cpus or min(self.cpus) < 0):
@@ -57,6 +67,9 @@ def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:
         "timer_slack": _attempt(config.timer_slack_ns > 0, lambda: _set_timer_slack(config.timer_slack_ns)),
         "sched_fifo": _attempt(config.fifo_priority is not None, lambda: _set_fifo(config.fifo_priority or 1)),
         "mlockall": _attempt(config.lock_memory, _lock_memory),
+        "wake_latency": _attempt(
+            config.wake_latency_us is not None, lambda: _set_wake_latency(config.wake_latency_us or 0)
+        ),
         "cpu_affinity": _attempt(config.cpus is not None, lambda: _set_affinity(config.cpus or ())),
         "gc_freeze": _attempt(config.freeze_gc, _freeze_gc),
     }
@@ -97,6 +110,16 @@ def _lock_memory() -> str:
         if libc.mlockall(flags) == 0:
             return what
     raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def _set_wake_latency(microseconds: int) -> str:
+    device = os.open(WAKE_LATENCY, os.O_WRONLY)
+    try:
+        os.write(device, struct.pack("=i", microseconds))
+    except OSError:
+        os.close(device)
+        raise
+    return f"{microseconds} us"  # the device stays open until this process ends
 
 
 def _has_capability(bit: int) -> bool:

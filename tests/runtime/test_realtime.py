@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-SETTINGS = {"timer_slack", "sched_fifo", "mlockall", "cpu_affinity", "gc_freeze"}
+SETTINGS = {"timer_slack", "sched_fifo", "mlockall", "wake_latency", "cpu_affinity", "gc_freeze"}
 
 
 def in_a_process_of_its_own(program: str) -> dict[str, str]:
@@ -24,7 +24,7 @@ def test_every_setting_is_reported_as_granted_or_with_the_reason_why_not():
 
 def test_what_is_not_asked_for_is_left_alone():
     report = in_a_process_of_its_own(
-        "nothing = RealtimeConfig(timer_slack_ns=0, fifo_priority=None, lock_memory=False, freeze_gc=False)\n"
+        "nothing = RealtimeConfig(0, fifo_priority=None, lock_memory=False, wake_latency_us=None, freeze_gc=False)\n"
         "report = request_realtime(nothing)"
     )
     assert report == dict.fromkeys(SETTINGS, "not asked")
@@ -40,6 +40,31 @@ def test_processes_that_are_started_later_are_not_real_time():
         "assert asked == [(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK)], asked"
     )
     assert report["sched_fifo"].startswith("granted")
+
+
+def test_processors_wake_in_time_for_as_long_as_the_process_lives(tmp_path):
+    """The kernel forgets the request where its device is closed."""
+    device = tmp_path / "cpu_dma_latency"
+    device.touch()
+    report = in_a_process_of_its_own(
+        "import os\n"
+        "from hiernav.runtime import realtime\n"
+        f"realtime.WAKE_LATENCY = {str(device)!r}\n"
+        "report = request_realtime(RealtimeConfig(fifo_priority=None, lock_memory=False, wake_latency_us=20))\n"
+        "report['held'] = [os.readlink(f'/proc/self/fd/{fd}') for fd in os.listdir('/proc/self/fd')"
+        " if os.path.exists(f'/proc/self/fd/{fd}')]"
+    )
+    assert report["wake_latency"] == "granted: 20 us" and device.read_bytes() == (20).to_bytes(4, sys.byteorder)
+    assert str(device) in report["held"]
+
+
+def test_a_machine_without_a_say_in_it_wakes_as_it_can(tmp_path):
+    report = in_a_process_of_its_own(
+        "from hiernav.runtime import realtime\n"
+        f"realtime.WAKE_LATENCY = {str(tmp_path / 'none')!r}\n"
+        "report = request_realtime(RealtimeConfig(fifo_priority=None, lock_memory=False))"
+    )
+    assert report["wake_latency"].startswith("refused: [Errno 2] No such file")
 
 
 def test_what_the_system_refuses_is_never_raised():

@@ -59,6 +59,7 @@ def test_a_file_goes_over_those_before_it_and_is_blamed_for_what_it_says(tmp_pat
         ("realtime.cpus=[]", "at least one"),
         ("realtime.cpus=[0, -1]", "cpus = [0, -1] must be numbers of CPUs from 0"),
         ("realtime.timer_slack_ns=-1", "timer_slack_ns = -1 ns must not be negative"),
+        ("realtime.wake_latency_us=-1", "wake_latency_us = -1 us must not be negative"),
         ("guard.tilt_limit=1.571", "tilt_limit = 1.571 rad must be in (0, pi/2)"),
         ("guard.max_tilted=21", "max_tilted = 21 must be from 1 to 20"),
         ("guard.max_non_finite=1000000000", "max_non_finite = 1000000000 must be from 1 to 20"),
