@@ -57,7 +57,7 @@ class Policies:
 
 
 def open_policies(path: str | Path) -> Policies:
-    """Policies of a bundle (ONNX Runtime) or of a run folder (torch).
+    """Policies of a bundle (ONNX Runtime) or of a run folder (torch, on one thread in this process from then on).
 
     Raises:
         ValueError: the folder is neither, or is incomplete (BundleError, RunError).

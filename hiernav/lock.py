@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -19,8 +20,8 @@ class _Held:
     def __init__(self, file: int) -> None:
         self.file = file
 
-    def __del__(self) -> None:
-        os.close(self.file)
+    def __del__(self, close: Callable[[int], None] = os.close) -> None:  # Python may have taken `os` away at its end
+        close(self.file)
 
 
 _held: WeakValueDictionary[Path, _Held] = WeakValueDictionary()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hiernav.draw import COLLISION, EDGE, GOAL, GREMLIN, OBSTACLE, PATH, PLAN, field_picture
 from hiernav.nav.lidar import LIDAR_BINS, lidar_closeness, surface_distance
+from hiernav.nav.opencv import cv2
 from hiernav.nav.termination import TerminationReason
 from hiernav.sim.layout import GREMLIN_HALF_SIZE
 from hiernav.sim.outline import Outlines

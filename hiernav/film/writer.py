@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 from PIL import Image
 
 from hiernav.film.top_view import COLORS, Frame, rgb
+from hiernav.nav.opencv import cv2
 
 SUFFIXES = (".mp4", ".gif")
 _CODECS = ("vp09", "mp4v")

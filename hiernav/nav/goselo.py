@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
+from hiernav.nav.opencv import cv2
 
 PIXELS = 64
 CHANNELS = ("obstacles_1", "obstacles_2", "obstacles_4", "visits_1", "visits_2", "visits_4")

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from hiernav.nav.occupancy import MAX_SIDE, RESOLUTION, OccupancyMap, check_geometry
+from hiernav.nav.opencv import cv2
 from hiernav.nav.plain_yaml import PlainLoader
 
 MAX_YAML_BYTES = 65536

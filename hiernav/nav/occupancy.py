@@ -10,9 +10,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from hiernav.nav.opencv import cv2
 
 RESOLUTION = 0.05
 MAX_SIDE = 16384

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.opencv import cv2
 
 AHEAD_S = 0.9
 """How far ahead a map is predicted [s]: about what a robot takes for the half of a plan that it follows."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.opencv import cv2
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

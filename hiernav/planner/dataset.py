@@ -20,6 +20,7 @@ from hiernav.config import TrainConfig
 from hiernav.nav import goselo
 from hiernav.nav.occupancy import OccupancyMap, VisitMap
 from hiernav.nav.search import PathField, random_shortcuts, resample
+from hiernav.orphans import end_with_parent
 from hiernav.planner.mix import WorldMix
 from hiernav.run import WorkersLost
 from hiernav.sim.layout import WorldSpec
@@ -160,7 +161,7 @@ def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], proc
             yield function(*task)
         return
     try:
-        with ProcessPoolExecutor(processes, mp_context=get_context("forkserver")) as pool:
+        with ProcessPoolExecutor(processes, get_context("forkserver"), end_with_parent) as pool:
             yield from pool.map(function, *zip(*tasks, strict=True))
     except BrokenProcessPool as error:
         raise WorkersLost(

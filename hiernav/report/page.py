@@ -9,9 +9,8 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-import cv2
-
 from hiernav.files import write_atomically
+from hiernav.nav.opencv import cv2
 from hiernav.report import figures, paper, tables
 from hiernav.report.book import Book
 from hiernav.report.findings import findings, shortfalls

@@ -6,12 +6,12 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
+from hiernav.orphans import end_with_parent
 from hiernav.reproduce.cells import Cell, Places
 from hiernav.reproduce.results import Code
 from hiernav.reproduce.work import Outcome, Report, run_cell
@@ -67,7 +67,7 @@ def run_in_process(cell: Cell, places: Places, report: Report, code: Code) -> Ou
 
 def _main(cell: Cell, places: Places, code: Code, parent: Connection) -> None:
     signal.signal(signal.SIGTERM, _stop)
-    _end_with_parent()
+    end_with_parent()  # a queue that was killed leaves no process behind that writes to its folders
     log = log_path(places, cell)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
@@ -92,18 +92,6 @@ def _main(cell: Cell, places: Places, code: Code, parent: Connection) -> None:
 
 def _stop(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
-
-
-def _end_with_parent() -> None:
-    """A queue that was killed leaves no process behind that writes to its folders."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def _death(code: int | None, log: Path) -> str:

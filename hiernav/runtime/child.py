@@ -33,14 +33,17 @@ class Child:
         descriptors: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        """Run `python -m module NEWS ARGUMENT ...`; NEWS is the descriptor on which `nudge` arrives."""
+        """Run `python -P -m module NEWS ARGUMENT ...`; NEWS is the descriptor on which `nudge` arrives.
+
+        -P: a file of the present folder that has the name of a module is not taken for it.
+        """
         news, self._news = os.pipe()
         os.set_blocking(self._news, False)
         package = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", module, str(news), *map(str, arguments)],
+                [sys.executable, "-P", "-m", module, str(news), *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(news, *descriptors),
                 stdout=_stderr(),

@@ -1,6 +1,6 @@
 """The planner in a process of its own: a keeper starts it, restarts it where it dies or hangs, and ends it.
 
-Run as `python -m hiernav.runtime.planner_process NEWS QUESTIONS MEMORY` by `ProcessPlanner`. The keeper has imported
+Run as `python -P -m hiernav.runtime.planner_process NEWS QUESTIONS MEMORY` by `ProcessPlanner`. The keeper has imported
 everything before it forks the planner, so that a restart takes milliseconds, and none of them in the control process.
 """
 

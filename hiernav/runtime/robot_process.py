@@ -1,8 +1,8 @@
 """A robot's adapter in a process of its own, which brakes by itself when commands stop coming.
 
-Run as `python -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to the
-control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot. Where the robot's own
-code fails, this process brakes the robot before it ends, and tells the control process why in one line.
+Run as `python -P -m hiernav.runtime.robot_process NEWS CALLS MEMORY SETTINGS` by `ProcessRobot`. Whatever happens to
+the control process, be it killed or stopped, this process goes on, and its watchdog brakes the robot. Where the robot's
+own code fails, this process brakes the robot before it ends, and tells the control process why in one line.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def main() -> None:
     leave_signals_to_parent()
     be_patient(reports=False)  # what the robot's code prints must not keep it from braking
     settings = json.loads(sys.argv[4])
+    sys.path.append("")  # the present folder may have the robot's modules; behind all others
     try:
         robot = make_robot(settings["robot"], settings["arguments"])
         leave_signals_to_parent()  # once more: the robot's driver may have seen to them

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import gymnasium
 import msgspec
 import numpy as np
 
 from hiernav.config import TrainConfig, load_config
 from hiernav.nav.goal import GOAL_RADIUS
+from hiernav.nav.opencv import cv2
 from hiernav.nav.option import Planner
 from hiernav.nav.termination import TerminationReason
 from hiernav.sim.factory import make_task

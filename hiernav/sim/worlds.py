@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hiernav.nav.occupancy import OccupancyMap
+from hiernav.nav.opencv import cv2
 from hiernav.nav.search import is_solvable
 from hiernav.sim.layout import (
     GREMLIN_DISC_RADIUS,

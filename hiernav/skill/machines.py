@@ -132,6 +132,8 @@ class Cluster:
         if self._joined:
             # Ray ranks workers behind all else on a machine; here the trainer waits for them
             os.environ.setdefault("RAY_worker_niceness", "0")
+            # a cluster that is started here would send usage statistics, and its notice of that is not shown
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             address = config.skill.ray_address
             sigterm = signal.getsignal(signal.SIGTERM)
             try:

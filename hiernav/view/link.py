@@ -38,7 +38,8 @@ LARGEST_MAP = 1_000_000
 START_SECONDS, CLOSING = 30.0, 1.0
 """What the page's process is given to come up, before the robot moves, and to end by itself [s]."""
 
-PROGRAM = (sys.executable, "-m", "hiernav.view")
+PROGRAM = (sys.executable, "-P", "-m", "hiernav.view")
+"""-P: no file of the present folder is taken for a module."""
 
 _decode = msgspec.json.Decoder(Command).decode
 

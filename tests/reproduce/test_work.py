@@ -216,13 +216,13 @@ WORK_OF_A_QUEUE = """
 import multiprocessing
 import threading
 
-from hiernav.reproduce.child import _end_with_parent
+from hiernav.orphans import end_with_parent
 
 FOREVER = threading.Event()
 
 
 def work(told):
-    _end_with_parent()
+    end_with_parent()
     with open(told, "w") as file:
         print("at work", file=file, flush=True)
         FOREVER.wait(20.0)

@@ -189,6 +189,23 @@ def test_a_training_leaves_the_cluster_that_it_joined_and_no_other(tmp_path, mon
     assert ray.joined is joined
 
 
+@pytest.mark.parametrize(("asked", "sent"), [(None, "0"), ("1", "1")])
+def test_a_cluster_sends_usage_statistics_only_where_that_was_asked_for(tmp_path, monkeypatch, asked, sent) -> None:
+    seen: list[str | None] = []
+
+    class Watched(FakeRay):
+        def init(self, address: str | None, **options: object) -> None:
+            seen.append(os.environ.get("RAY_USAGE_STATS_ENABLED"))
+            super().init(address, **options)
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", asked or "")
+    if asked is None:
+        del os.environ["RAY_USAGE_STATS_ENABLED"]
+    monkeypatch.setitem(sys.modules, "ray", Watched())
+    Cluster(cluster_config(tmp_path), 64)
+    assert seen == [sent]
+
+
 def test_sigterm_is_still_answered_by_the_training_that_joined_a_cluster(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", FakeRay())
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
