@@ -46,7 +46,8 @@ if __name__ == "__main__":
         if sys.stdout is not None:
             sys.stdout.flush()
         if PatientWriter.lost:
-            print("run_loop: not all of the output was taken", file=sys.stderr, flush=True)
+            why = f": {PatientWriter.why}" if PatientWriter.why else ""
+            print(f"run_loop: not all of the output was taken{why}", file=sys.stderr, flush=True)
     for number in stop_signals():
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)

@@ -256,7 +256,7 @@ class Episodes:
                 try:
                     drive.draw(layout, unfinished, title)
                     unfinished.replace(file)
-                except OSError as error:
+                except Exception as error:  # no memory, or no matplotlib: a picture can be spared
                     warn(file, error)
                 finally:
                     with suppress(OSError):
@@ -265,8 +265,7 @@ class Episodes:
 
 def _hang_up(server: ControlServer) -> None:
     """Close and remove a socket at which nobody has listened yet."""
-    with server:
-        pass
+    server.close()
 
 
 def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle, spec: RobotSpec) -> Recorder | None:

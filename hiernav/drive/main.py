@@ -14,13 +14,13 @@ from pathlib import Path
 from hiernav.drive.arguments import join_goal, make_parser, require_place, settings_of
 from hiernav.drive.episodes import Episodes
 from hiernav.drive.exits import BAD_BUNDLE, BAD_GOAL, BAD_INPUT, FAULT, OK
-from hiernav.drive.screen import complain, require_writable, save, screen
+from hiernav.drive.screen import complain, in_one_line, require_writable, save, screen
 from hiernav.drive.world import GoalError, given_goal, layout_of
 from hiernav.nav.bundle import Bundle, BundleError, file_sha256, load_bundle
 from hiernav.nav.occupancy import RESOLUTION
 from hiernav.runtime.control import default_socket, tell
 from hiernav.runtime.dry_run import print_report, report
-from hiernav.runtime.loop import noting_signals, stop_signals
+from hiernav.runtime.loop import hear_signals, noting_signals, stop_signals
 from hiernav.runtime.patient import hurry
 from hiernav.runtime.process_planner import ProcessPlanner
 from hiernav.runtime.process_robot import ProcessRobot, simulated
@@ -46,6 +46,7 @@ def main(argv: Sequence[str] | None, description: str, home: Path) -> int:
     for number in stop_signals():
         signal.signal(number, signal.default_int_handler)  # until the loop runs, each of them is a Ctrl-C
     try:
+        hear_signals()
         if arguments.tell is not None:
             return _tell(arguments)
         if arguments.seed < 0:
@@ -60,8 +61,11 @@ def main(argv: Sequence[str] | None, description: str, home: Path) -> int:
         complain(f"bundle refused: {error}")
         return BAD_BUNDLE
     except (ValueError, OSError, RuntimeError) as error:
-        complain(" ".join(str(error).split()))
+        complain(in_one_line(error))
         return BAD_GOAL if isinstance(error, GoalError) else BAD_INPUT
+    except MemoryError as error:
+        complain(in_one_line(error))
+        return FAULT
 
 
 def _tell(arguments: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.ma  # by np.median: now, and not in the control step in which a robot is stuck first
 
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.nav.path import distances, polyline

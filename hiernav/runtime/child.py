@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from hiernav.runtime.loop import STOP_SIGNALS
+from hiernav.runtime.loop import STOP_SIGNALS, hear_signals
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 DYING = 0.5
@@ -111,6 +111,7 @@ def leave_signals_to_parent() -> None:
     """In the child: `STOP_SIGNALS`, which may be sent to all processes at once, are for the parent to act upon."""
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    hear_signals()  # of its own children's ends
 
 
 def wait_for_news(news: int, timeout: float | None) -> bytes | None:

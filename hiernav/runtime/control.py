@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import logging
 import math
 import os
+import resource
 import select
 import socket
 import stat
@@ -31,6 +33,9 @@ LOOK_AGAIN = 0.005
 CLIENTS = 32
 """Clients that may be at their line at the same time; the one after them takes the place of the first."""
 COMMANDS = ("goal X,Y", "cancel", "pause", "resume", "stop", "acknowledge", "status", "quit")
+
+NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+"""What `accept` says where it is not the client's fault."""
 
 LONGEST_PATH = 107
 """Of a socket [bytes]; the system's."""
@@ -144,21 +149,32 @@ class ControlServer:
             raise ValueError(f"control socket {path}: the folder belongs to another user")
         self._lock = _Lock(path)
         try:
+            _require_room(path)
             self._server = self._listening()
         except BaseException:
             self._lock.release()
             raise
         self._closed = False
+        self._told = ""
         self._thread = threading.Thread(target=self._listen, name="control", daemon=True)
 
     def __enter__(self) -> ControlServer:
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError:  # the system has no room for another thread
+            self.close()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Listen no longer, or never, and leave nothing at the path."""
         self._closed = True
         self._server.shutdown(socket.SHUT_RDWR)  # wakes the thread
-        self._thread.join(2.0)
+        if self._thread.ident is not None:
+            self._thread.join(2.0)
         self._server.close()
         self.path.unlink(missing_ok=True)
         self._lock.release()
@@ -186,8 +202,30 @@ class ControlServer:
         return server
 
     def _listen(self) -> None:
+        """The thread. It goes on whatever happens, such as no memory: else nobody could stop the robot any more."""
         clients: list[_Client] = []  # the first to have come is the first to run out of time
         obeyed: list[_Client] = []
+        while not self._closed:
+            try:
+                self._answer_clients(clients, obeyed)
+            except Exception as error:
+                self._complain(f"{type(error).__name__}: {error}; all clients are dropped")
+                for client in (*clients, *obeyed):
+                    client.socket.close()
+                clients.clear()
+                obeyed.clear()
+                time.sleep(0.01)
+        for client in clients:
+            client.socket.close()
+
+    def _complain(self, why: str) -> None:
+        """Tell why no command can be given, once as long as that is why."""
+        if why != self._told:
+            log.error("control socket %s: %s", self.path, why)
+        self._told = why
+
+    def _answer_clients(self, clients: list[_Client], obeyed: list[_Client]) -> None:
+        """Listen until the end, with who is at a line in `clients`, and who waits for an answer in `obeyed`."""
         while not self._closed:
             wait = max(clients[0].deadline - time.monotonic(), 0.0) if clients else None
             if obeyed:
@@ -197,7 +235,7 @@ class ControlServer:
             for client in [each for each in clients if each in ready and each.hear(self.driver)]:
                 clients.remove(client)
                 obeyed.append(client)
-            obeyed = [client for client in obeyed if not client.answered()]
+            obeyed[:] = [client for client in obeyed if not client.answered()]
             while len(obeyed) > CLIENTS:
                 obeyed.pop(0).answer({"taken": None, "error": "too many clients wait for their answers"})
             while clients and clients[0].deadline <= time.monotonic():
@@ -205,16 +243,17 @@ class ControlServer:
             if self._server in ready:
                 try:
                     clients.append(_Client(self._server.accept()[0]))
-                except OSError:  # the client is gone again, there is no room for one, or this is the end
+                except OSError as error:  # the client is gone again, there is no room for one, or this is the end
+                    if error.errno in NO_ROOM:
+                        self._complain(f"{error.strerror}: nobody can give a command")
                     time.sleep(0.01)
                     continue
+                self._told = ""
                 if len(clients) > CLIENTS:
                     clients.pop(0).answer({"error": "too many clients"})
         for client in obeyed:
             if not client.answered():
                 client.answer({"taken": False, "error": "the loop has ended"})
-        for client in clients:
-            client.socket.close()
 
 
 class _Client:
@@ -287,6 +326,20 @@ def _require_short(path: Path) -> None:
     size = len(os.fsencode(path))
     if size > LONGEST_PATH:
         raise ValueError(f"control socket {path}: a path of {size} bytes, expected at most {LONGEST_PATH}")
+
+
+def _require_room(path: Path) -> None:
+    """ValueError unless this process may have as many clients as are served at the same time."""
+    places: list[int] = []
+    try:
+        places += (os.open(os.devnull, os.O_RDONLY) for _ in range(2 * CLIENTS + 1))
+    except OSError as error:
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        why = f"{error.strerror} for {2 * CLIENTS} clients, RLIMIT_NOFILE is {limit}"
+        raise ValueError(f"control socket {path}: {why}") from None
+    finally:
+        for place in places:
+            os.close(place)
 
 
 def _connect(client: socket.socket, path: Path, patience: float) -> None:

@@ -228,6 +228,15 @@ def stop_signals() -> tuple[signal.Signals, ...]:
     return tuple(number for number in STOP_SIGNALS if number is not signal.SIGHUP or not ignored)
 
 
+def hear_signals() -> None:
+    """Have signals arrive, whatever whoever started this process has left it with.
+
+    A signal that is blocked never comes, and with SIGCHLD ignored nobody learns how a child has ended.
+    """
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (*STOP_SIGNALS, signal.SIGCHLD))
+
+
 @contextmanager
 def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     before = {number: signal.signal(number, handler) for number in stop_signals()}

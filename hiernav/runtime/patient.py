@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import select
@@ -13,6 +14,8 @@ from typing import Any, TextIO
 
 PATIENCE, BRIEFLY = 1.0, 0.2
 """Time that a reader is given to take something: of a report, once the end was asked for, and of a complaint [s]."""
+NOBODY = (errno.EPIPE, errno.EIO, errno.ENXIO, errno.ECONNRESET)
+"""What writing to a pipe, a terminal or a socket says once nobody reads there any more."""
 
 
 class PatientWriter(io.RawIOBase):
@@ -24,6 +27,8 @@ class PatientWriter(io.RawIOBase):
 
     hurried = lost = False
     """Whether the end was asked for, and whether anything was lost that should have been faithful."""
+    why = ""
+    """What the system said when it was, if anything: a full disk."""
 
     def __init__(self, descriptor: int, faithful: bool) -> None:
         self._descriptor, self._faithful = descriptor, faithful
@@ -70,8 +75,10 @@ class PatientWriter(io.RawIOBase):
         except BlockingIOError:  # there is room, but less than it takes
             time.sleep(moment)
             return 0
-        except OSError:
+        except OSError as error:
             self._gone = True
+            if self._faithful and error.errno not in NOBODY:
+                PatientWriter.lost, PatientWriter.why = True, error.strerror or str(error)
             raise
 
 
@@ -81,7 +88,21 @@ def be_patient(reports: bool = True) -> None:
     Args:
         reports: whether the standard output is for reports; else it is for complaints as well.
     """
+    _occupy_standard_descriptors()
     sys.stdout, sys.stderr = _patient(sys.stdout, reports), _patient(sys.stderr, False)
+
+
+def _occupy_standard_descriptors() -> None:
+    """Where standard input, output or error were closed before this process began, put nowhere in their places.
+
+    Else the next file or pipe that is opened gets that number, and is what a library's complaint is written into, and
+    what a child is given as its own.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # which takes the lowest number that is free: this one
 
 
 def hurry() -> None:
@@ -95,7 +116,9 @@ def _patient(stream: TextIO, faithful: bool) -> TextIO:
     stream.flush()
     raw = io.BufferedWriter(PatientWriter(stream.fileno(), faithful))
     at_once = stream.line_buffering or stream.write_through  # the latter alone under PYTHONUNBUFFERED
-    return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=at_once)
+    # what a terminal of few characters cannot show is no reason to end a run
+    errors = "backslashreplace" if stream.errors == "strict" else stream.errors
+    return io.TextIOWrapper(raw, stream.encoding, errors, line_buffering=at_once)
 
 
 def _without_blocking(descriptor: int) -> int:

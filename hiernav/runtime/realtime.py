@@ -9,6 +9,7 @@ import os
 import resource
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,8 @@ class RealtimeConfig:
     timer_slack_ns: int = 1
     """Timers of this thread fire at most this late [ns]; the system's default is 50000. 0 leaves it alone."""
     fifo_priority: int | None = 50
-    """SCHED_FIFO priority, 1 to 99; None stays with the normal scheduler."""
+    """SCHED_FIFO priority of the loop, 1 to 98; None stays with the normal scheduler. The robot's adapter has one more:
+    its watchdog must get the processor also where the loop does not let go of it."""
     lock_memory: bool = True
     """Keep all pages in memory (mlockall)."""
     cpus: tuple[int, ...] | None = None
@@ -50,14 +52,18 @@ class RealtimeConfig:
             raise ValueError(
                 f"RealtimeConfig.wake_latency_us = {self.wake_latency_us} us must not be negative nor beyond 2147483647"
             )
-        if self.fifo_priority is not None and not 1 <= self.fifo_priority <= 99:
-            raise ValueError(f"RealtimeConfig.fifo_priority = {self.fifo_priority} must be 1 to 99, or null")
+        if self.fifo_priority is not None and not 1 <= self.fifo_priority <= 98:
+            raise ValueError(f"RealtimeConfig.fifo_priority = {self.fifo_priority} must be 1 to 98, or null")
         if self.cpus is not None and (not self.cpus or min(self.cpus) < 0):
             raise ValueError(f"RealtimeConfig.cpus = {list(self.cpus)} must be numbers of CPUs from 0, at least one")
 
 
-def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:
+def request_realtime(config: RealtimeConfig | None = None, before_the_loop: bool = False) -> dict[str, str]:
     """Apply the settings to this process and thread.
+
+    Args:
+        config: the defaults if None.
+        before_the_loop: whether this process comes before the loop where both want the same processor.
 
     Returns:
         One entry per setting: "granted", "granted: ...", "not asked" or "refused: why". Never raises.
@@ -65,7 +71,9 @@ def request_realtime(config: RealtimeConfig | None = None) -> dict[str, str]:
     config = config or RealtimeConfig()
     return {
         "timer_slack": _attempt(config.timer_slack_ns > 0, lambda: _set_timer_slack(config.timer_slack_ns)),
-        "sched_fifo": _attempt(config.fifo_priority is not None, lambda: _set_fifo(config.fifo_priority or 1)),
+        "sched_fifo": _attempt(
+            config.fifo_priority is not None, lambda: _set_fifo(config.fifo_priority or 1, before_the_loop)
+        ),
         "mlockall": _attempt(config.lock_memory, _lock_memory),
         "wake_latency": _attempt(
             config.wake_latency_us is not None, lambda: _set_wake_latency(config.wake_latency_us or 0)
@@ -92,11 +100,15 @@ def _set_timer_slack(nanoseconds: int) -> str:
     return f"{nanoseconds} ns"
 
 
-def _set_fifo(priority: int) -> str:
+def _set_fifo(priority: int, above: bool) -> str:
     # Children (the planner's process) start with the normal scheduler again.
     policy = os.SCHED_FIFO | getattr(os, "SCHED_RESET_ON_FORK", 0)
+    if above:
+        with suppress(PermissionError):  # it lies above this user's limit
+            os.sched_setscheduler(0, policy, os.sched_param(priority + 1))
+            return f"priority {priority + 1}"
     os.sched_setscheduler(0, policy, os.sched_param(priority))
-    return f"priority {priority}"
+    return f"priority {priority}{', no more than the loop: this user may not have one above it' if above else ''}"
 
 
 def _lock_memory() -> str:

@@ -73,14 +73,15 @@ class Recorder(Observer):
             self._writer.add_metadata(ABOUT, dict(about or {}))
             self._channels = {topic: self._open_channel(topic) for topic in messages.TOPICS}
             self._file.flush()
-        except OSError as error:
+            self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+            self._thread.start()
+        except (OSError, RuntimeError) as error:  # the latter where the system has no room for another thread
             with suppress(OSError):  # what was not written still is not
                 self._file.close()
             if new:
                 self.path.unlink(missing_ok=True)
-            raise OSError(f"{self.path}: the recording cannot be written: {error.strerror}") from None
-        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
-        self._thread.start()
+            why = getattr(error, "strerror", None) or error
+            raise OSError(f"{self.path}: the recording cannot be written: {why}") from None
 
     def tick(self, record: TickRecord) -> None:
         self._put(record)

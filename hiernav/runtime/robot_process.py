@@ -162,7 +162,7 @@ class Adapter:
     def _follow(self) -> bool:
         """Hand commands over and frames back. True once this process is not needed any more, False if it is alone."""
         robot, idle = self.robot, 0.25 * self._period
-        granted = request_realtime(self._realtime)
+        granted = request_realtime(self._realtime, before_the_loop=True)
         period, action_dim = float(robot.control_period), int(robot.action_dim)
         facts = {"control_period": period, "action_dim": action_dim, "realtime": granted}
         self._publish()

@@ -93,6 +93,7 @@ class ViewerLink(Observer):
         """(2,) goal to set at the first tick [m]."""
         self._encoder = messages.TickEncoder()
         self._shown_at = -math.inf
+        self._troubled = False
         self._large: OccupancyMap | None = None
         self._coarse: OccupancyMap | None = None
         self._coarsening = False
@@ -134,6 +135,16 @@ class ViewerLink(Observer):
                 self.refused += 1
 
     def tick(self, record: TickRecord) -> None:
+        try:
+            self._show(record)
+        except Exception:  # no memory, or no thread: were it raised, the page would be heard no more either
+            self.dropped += 1
+            self._encoder = messages.TickEncoder()
+            if not self._troubled:
+                log.exception("a tick could not be shown on the live page, which is heard as before")
+            self._troubled = True
+
+    def _show(self, record: TickRecord) -> None:
         if self._socket is None:
             return
         if abs(record.time - self._shown_at) < 1.0 / SHOW_HZ:
@@ -231,7 +242,10 @@ class ViewerLink(Observer):
         """Large maps are made coarser in a thread, one at a time; the newest that is done is shown, at first none."""
         if occupancy is not self._large and not self._coarsening:
             self._large, self._coarsening = occupancy, True
-            threading.Thread(target=self._make_coarse, args=(occupancy,), name="coarse map", daemon=True).start()
+            try:
+                threading.Thread(target=self._make_coarse, args=(occupancy,), name="coarse map", daemon=True).start()
+            except RuntimeError:  # the system has no room for another thread: tried again with the next tick
+                self._large, self._coarsening = None, False
         return replace(record, occupancy=self._coarse)
 
     def _make_coarse(self, occupancy: OccupancyMap) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -321,3 +324,14 @@ def test_a_robot_that_is_walled_in_stays() -> None:
     walled = empty_map((3.0, 3.0))
     walled.occupied[:] = True
     assert_allclose(ways(AHEAD[0], occupancy=walled), np.zeros((8, 10, 2)), atol=1e-12)
+
+
+def test_the_first_way_out_imports_nothing() -> None:
+    """That would be in a control step, from a disk that may be slow, in a process that may have no file left."""
+    program = (
+        "import sys\nimport numpy as np\nfrom hiernav.nav.occupancy import empty_map\n"
+        "from hiernav.nav.recovery import ways_out\nbefore = set(sys.modules)\n"
+        "ways_out(np.zeros(3), 0.1 * np.ones((10, 2)) * np.arange(1, 11)[:, None], empty_map((2.0, 2.0)), 0.1)\n"
+        "print(sorted(set(sys.modules) - before))"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "[]\n"

@@ -6,6 +6,8 @@ import errno
 import io
 import json
 import os
+import re
+import resource
 import signal
 import socket
 import subprocess
@@ -451,3 +453,81 @@ def test_the_rate_is_that_of_driving_whatever_lies_between_two_runs():
     loop.run()
     assert (loop.ticks, loop.overruns) == (20, 2)
     assert summary_of(account_of(2), loop, timer)["timing"]["rate"] == pytest.approx(20 / 2.2)
+
+
+def test_a_disk_that_is_full_already_is_refused_before_anything_moves(run, capsys, monkeypatch):
+    """An empty file fits onto it, the summary would not."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr("hiernav.runtime.driver.Driver.run", lambda *_: pytest.fail("it moved"))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # the kernel refuses more, as a full disk does
+    try:
+        code = run(*SHORT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert code == exits.BAD_INPUT
+    assert capsys.readouterr().err == "run_loop: --out: out/summary.json cannot be written: File too large\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "says"), [(MemoryError(), "no memory is left (RLIMIT_AS is "), (ImportError("no matplotlib"), "no mat")]
+)
+def test_a_picture_that_cannot_be_drawn_changes_no_exit_code(run, tmp_path, capsys, monkeypatch, error, says):
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(picture.Drive, "draw", failing)
+    assert run(*SHORT) == exits.OK
+    assert capsys.readouterr().err.startswith(f"run_loop: out/drive-0.png is not written: {says}")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (MemoryError(), exits.FAULT, "no memory is left (RLIMIT_AS is "),
+        (OSError(errno.EMFILE, "Too many open files"), exits.BAD_INPUT, "Too many open files (RLIMIT_NOFILE is "),
+        (BlockingIOError(errno.EAGAIN, "No room"), exits.BAD_INPUT, "No room (RLIMIT_NPROC is "),
+        (RuntimeError("can't start new thread"), exits.BAD_INPUT, "can't start new thread (RLIMIT_NPROC is "),
+    ],
+)
+def test_what_the_system_has_no_room_for_is_told_in_one_line_with_limit_and_place(
+    run, capsys, monkeypatch, error, code, says
+):
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(drive_main, "load_bundle", failing)
+    assert run(*SHORT) == code
+    told = capsys.readouterr().err
+    assert told.startswith("run_loop: ") and says in told and told.count("\n") == 1
+    assert re.search(r", at main\.py:[0-9]+$", told.rstrip()), told
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_json_that_the_disk_did_not_take_is_told(tmp_path):
+    with open("/dev/full", "wb") as full:
+        command = [sys.executable, RUN_LOOP, *SHORT, "--no-pictures", "--out", tmp_path / "out", "--json", "-"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0
+    assert done.stderr.endswith("run_loop: not all of the output was taken: No space left on device\n")
+
+
+def test_a_signal_that_whoever_started_it_had_blocked_is_heard(run, capsys):
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    try:
+        run("--tell", "status", "--control", "nobody")
+        assert signal.SIGTERM not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def test_how_a_child_has_ended_is_known_also_where_sigchld_was_ignored():
+    """Else the planner's keeper fails as soon as its planner ends, and a killed adapter seems to have ended well."""
+    program = (
+        "import subprocess, sys\nfrom hiernav.runtime.child import leave_signals_to_parent\n"
+        "leave_signals_to_parent()\nprint(subprocess.call([sys.executable, '-c', 'raise SystemExit(7)']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGCHLD, signal.SIG_IGN),
+    )  # fmt: skip
+    assert done.stdout == "7\n"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import resource
 import socket
 import tempfile
 import threading
@@ -20,7 +22,7 @@ from puck import Puck, driver_of
 
 from hiernav.runtime import control
 from hiernav.runtime.clock import MonotonicClock
-from hiernav.runtime.control import ControlServer, obey, tell
+from hiernav.runtime.control import CLIENTS, ControlServer, obey, tell
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.requests import LIMIT
 from hiernav.runtime.robot import SensorFrame
@@ -373,3 +375,62 @@ def test_a_loop_is_found_where_no_temporary_file_can_be_made(monkeypatch, tmp_pa
 def test_a_goal_must_be_finite():
     with pytest.raises(ValueError, match="finite"):
         driver_of().set_goal(np.array([np.nan, 0.0]))
+
+
+def test_what_goes_wrong_for_one_client_keeps_nobody_from_stopping_the_robot(tmp_path, monkeypatch):
+    """Were the thread gone, the robot would drive on, and no command would reach it any more."""
+    path, failures = tmp_path / "loop.sock", [MemoryError()]
+    describe = control.describe
+
+    def failing(driver: Driver) -> dict[str, object]:
+        if failures:
+            raise failures.pop()
+        return describe(driver)
+
+    monkeypatch.setattr(control, "describe", failing)
+    with ControlServer(driver_of(), path):
+        with pytest.raises(ValueError, match="no loop answers"):
+            tell(path, "status")
+        assert "error" not in tell(path, "status")
+
+
+def test_a_process_without_room_for_clients_is_told_before_it_listens(tmp_path):
+    """It could be driven otherwise, and nobody could connect to stop it."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    taken, limit, driver = set(map(int, os.listdir("/proc/self/fd"))), 0, driver_of()
+    while limit - sum(number < limit for number in taken) < CLIENTS:
+        limit += 1
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+    try:
+        with pytest.raises(ValueError, match=f"for {2 * CLIENTS} clients, RLIMIT_NOFILE is {limit}"):
+            ControlServer(driver, tmp_path / "loop.sock")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert not list(tmp_path.iterdir())
+
+
+def test_that_nobody_can_connect_any_more_is_told_once(tmp_path, monkeypatch, caplog):
+    path, tries = tmp_path / "loop.sock", []
+
+    class Full(socket.socket):
+        def accept(self):
+            tries.append(0)
+            if len(tries) < 4:
+                raise OSError(errno.EMFILE, "Too many open files")
+            return super().accept()
+
+    monkeypatch.setattr(control.socket, "socket", Full)
+    with ControlServer(driver_of(), path):
+        assert "error" not in tell(path, "status")
+    assert [each for each in caplog.messages if "Too many open files: nobody can" in each] == caplog.messages
+    assert len(caplog.messages) == 1
+
+
+def test_a_system_without_room_for_a_thread_leaves_nothing_at_the_path(tmp_path, monkeypatch):
+    def no_room(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_room)
+    with pytest.raises(RuntimeError, match="start new thread"), ControlServer(driver_of(), tmp_path / "loop.sock"):
+        pass
+    assert not list(tmp_path.iterdir())

@@ -18,6 +18,7 @@ from hiernav.runtime.patient import PatientWriter
 def as_before(monkeypatch):
     monkeypatch.setattr(PatientWriter, "hurried", False)
     monkeypatch.setattr(PatientWriter, "lost", False)
+    monkeypatch.setattr(PatientWriter, "why", "")
 
 
 def ends(writer: PatientWriter, data: bytes) -> bool:
@@ -79,3 +80,40 @@ def test_all_of_a_long_text_arrives_where_somebody_reads():
     writer.join(30.0)
     os.close(reader)
     os.close(end)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs Linux's /dev/full")
+@pytest.mark.parametrize("faithful", [False, True])
+def test_a_report_that_a_full_disk_does_not_take_is_lost_and_the_reason_kept(faithful):
+    with open("/dev/full", "wb", buffering=0) as full, pytest.raises(OSError, match="No space left"):
+        PatientWriter(full.fileno(), faithful).write(b"x")
+    assert (PatientWriter.lost, PatientWriter.why) == (faithful, "No space left on device" if faithful else "")
+
+
+def test_a_report_that_nobody_wants_to_read_any_more_is_not_lost():
+    reader, end = os.pipe()
+    os.close(reader)
+    with pytest.raises(BrokenPipeError):
+        PatientWriter(end, True).write(b"x")
+    os.close(end)
+    assert not PatientWriter.lost
+
+
+@pytest.mark.parametrize("closed", [(0,), (1,), (0, 1), (0, 1, 2)])
+def test_what_was_closed_before_the_start_is_no_number_for_another_file(tmp_path, closed):
+    """A child would be given nowhere in the place of that file, or a library write its complaints into it."""
+    program = (
+        "import os, sys\nfrom hiernav.runtime.patient import be_patient\nbe_patient()\n"
+        "open(sys.argv[1], 'w').write(str(min(os.pipe())))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "x")], preexec_fn=lambda: [os.close(each) for each in closed]
+    )
+    assert done.returncode == 0 and int((tmp_path / "x").read_text()) > 2
+
+
+def test_what_a_terminal_of_few_characters_cannot_show_ends_nothing():
+    program = "from hiernav.runtime.patient import be_patient\nbe_patient()\nprint('caf\\xe9')"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True)
+    assert done.stdout == b"caf\\xe9\n"

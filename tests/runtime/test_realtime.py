@@ -67,8 +67,27 @@ def test_a_machine_without_a_say_in_it_wakes_as_it_can(tmp_path):
     assert report["wake_latency"].startswith("refused: [Errno 2] No such file")
 
 
+def test_the_adapter_comes_before_the_loop_and_beside_it_where_its_user_may_not():
+    """At one priority a loop that never lets go of its processor would keep the adapter's watchdog from braking."""
+    report = in_a_process_of_its_own(
+        "import os\n"
+        "asked, most = [], 99\n"
+        "def ask(pid, policy, param):\n"
+        "    asked.append(param.sched_priority)\n"
+        "    if param.sched_priority > most: raise PermissionError(1, 'Operation not permitted')\n"
+        "os.sched_setscheduler = ask\n"
+        "config = RealtimeConfig(timer_slack_ns=0, fifo_priority=7, lock_memory=False, freeze_gc=False)\n"
+        "loop = request_realtime(config)['sched_fifo']\n"
+        "adapter = request_realtime(config, before_the_loop=True)['sched_fifo']\n"
+        "most = 7\n"
+        "report = [loop, adapter, request_realtime(config, before_the_loop=True)['sched_fifo'], asked]"
+    )
+    assert report[:2] == ["granted: priority 7", "granted: priority 8"]
+    assert report[2].startswith("granted: priority 7, no more than the loop") and report[3] == [7, 8, 8, 7]
+
+
 def test_what_the_system_refuses_is_never_raised():
-    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(fifo_priority=99, cpus=(100000,)))")
+    report = in_a_process_of_its_own("report = request_realtime(RealtimeConfig(fifo_priority=98, cpus=(100000,)))")
     assert report["sched_fifo"].startswith(("granted", "refused: "))
     assert report["cpu_affinity"].startswith("refused: ")
 

@@ -196,3 +196,13 @@ def test_a_record_that_cannot_be_encoded_is_left_out_and_the_others_are_kept(tmp
     writer.close()
     assert [tick.index for tick in RunLog(writer.path).ticks()] == [0, 2]
     assert (writer.ticks, writer.dropped, writer.error) == (2, 1, None)
+
+
+def test_a_system_without_room_for_a_thread_costs_no_recording_its_name(tmp_path, monkeypatch):
+    def no_room(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_room)
+    with pytest.raises(OSError, match="cannot be written: can't start new thread"):
+        Recorder(tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())

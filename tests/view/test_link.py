@@ -18,7 +18,7 @@ from page_stub import Asked, link_to
 
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime import messages
-from hiernav.runtime.observe import Event, TickRecord
+from hiernav.runtime.observe import Audience, Event, TickRecord
 from hiernav.runtime.robot import SensorFrame
 from hiernav.runtime.supervisor import Mode
 from hiernav.view import link as link_module
@@ -325,4 +325,47 @@ def test_of_a_large_map_that_changes_the_newest_that_is_done_is_shown_and_one_th
     until(lambda: shown(3) is not first)
     assert shown(3).occupied[150].all() and begun == [maps[0], maps[3]]
     link._process.kill()
+    link.close()
+
+
+def test_a_page_that_cannot_be_shown_a_tick_still_stops_the_robot(monkeypatch):
+    """For want of memory, say. A link that raised would be dropped from the audience, and its stop button with it."""
+    asked = Asked()
+    link = link_to('link.recv(1000000)\nsay(kind="estop")\nwhile link.recv(1000000): pass', asked)
+    audience, failures = Audience([link]), [MemoryError()]
+    encode = messages.TickEncoder.encode
+
+    def failing(encoder: messages.TickEncoder, tick: TickRecord) -> object:
+        if failures:
+            raise failures.pop()
+        return encode(encoder, tick)
+
+    monkeypatch.setattr(messages.TickEncoder, "encode", failing)
+    for index in range(2):
+        audience.tell(lambda observer, index=index: observer.tick(record(index)))
+    assert audience.observers == [link] and (link.dropped, link.shown) == (1, 1)
+    for _ in range(6000):
+        audience.tell(lambda observer: observer.make_requests())
+        if asked.calls:
+            break
+        time.sleep(0.005)
+    link.close()
+    assert asked.calls == [("estop",)]
+
+
+def test_a_large_map_is_shown_later_where_the_system_has_no_room_for_a_thread(monkeypatch):
+    link = link_to("while link.recv(1000000): pass")
+    large = OccupancyMap(np.zeros((1200, 1200), np.bool_))
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            threading.Thread, "start", lambda _: (_ for _ in ()).throw(RuntimeError("can't start new thread"))
+        )
+        link.tick(record(0, occupancy=large))
+    assert (link.shown, link.dropped) == (1, 0)
+    ticks, deadline = 1, time.monotonic() + 30.0
+    while link._coarse is None:
+        assert time.monotonic() < deadline
+        link.tick(record(ticks, occupancy=large))
+        ticks += 1
+        time.sleep(0.005)
     link.close()

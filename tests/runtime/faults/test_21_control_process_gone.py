@@ -182,3 +182,37 @@ def _zombie(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
+
+
+SPINNING = textwrap.dedent(
+    """
+    import os, sys, time
+    import numpy as np
+    from hiernav.runtime.process_robot import ProcessRobot
+    from hiernav.runtime.realtime import RealtimeConfig, request_realtime
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    asked = RealtimeConfig(lock_memory=False, freeze_gc=False)
+    robot = ProcessRobot(sys.argv[1] + ":make", {"path": sys.argv[2]}, realtime=asked)
+    robot.read()
+    asked_for = [request_realtime(asked)["sched_fifo"], robot.realtime["sched_fifo"]]
+    granted = all(text.startswith("granted") and "no more than" not in text for text in asked_for)
+    robot.send(np.array([1.0, 0.0]))
+    time.sleep(0.02)
+    end = time.monotonic() + 0.5
+    while time.monotonic() < end:
+        pass
+    print(int(granted), robot.watchdog_trips)
+    robot.close()
+    """
+)
+
+
+def test_the_adapter_brakes_though_the_loop_does_not_let_go_of_the_only_processor(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", SPINNING, str(ROBOT), str(tmp_path / "robot.log")],
+        capture_output=True, text=True, check=True, timeout=120.0,
+    )  # fmt: skip
+    granted, trips = map(int, done.stdout.split())
+    if not granted:
+        pytest.skip("SCHED_FIFO is not granted here")
+    assert trips == 1
