@@ -81,7 +81,7 @@ def snippets() -> list[str]:
 
 
 def test_there_are_snippets() -> None:
-    assert len(snippets()) == 4
+    assert len(snippets()) == 5
 
 
 @pytest.mark.parametrize("code", snippets())

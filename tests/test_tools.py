@@ -90,18 +90,15 @@ def test_all_contenders_of_a_race_update_on_the_processor(monkeypatch, contender
     class Stop(Exception):
         pass
 
-    def trainer(config, run):
-        made.append(config)
+    def trainer(config, run, make):
+        made.append((config.skill.device, make))
         raise Stop
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(skill_train, "SkillTrainer", trainer)
-    monkeypatch.setattr(
-        skill_train, "make_learner", skill_train.make_learner
-    )  # put back, whatever a contender makes of it
     arguments = SimpleNamespace(
         train=contender, config=ROOT / "configs/point.yaml", every=100, reach=0.9, settings=["skill.device=auto"]
     )
     with pytest.raises(Stop):
         race._train(arguments)
-    assert [config.skill.device for config in made] == ["cpu"]
+    assert made == [("cpu", race.torchrl_learner if contender == "torchrl" else skill_train.make_learner)]

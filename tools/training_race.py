@@ -88,8 +88,8 @@ def _race(options: list[str], name: str) -> list[dict[str, Any]]:
 def _train(arguments: argparse.Namespace) -> None:
     import torch
 
-    import hiernav.skill.train as skill_train
     from hiernav.run import Run
+    from hiernav.skill.train import SkillTrainer, make_learner
 
     settings = [
         f"skill.eval_every_steps={arguments.every}", f"skill.eval_episodes={EPISODES}",
@@ -98,12 +98,11 @@ def _train(arguments: argparse.Namespace) -> None:
     ]  # fmt: skip
     if arguments.train == "float32":
         settings.append("skill.precision=float32")
-    if arguments.train == "torchrl":
-        skill_train.make_learner = torchrl_learner
     with tempfile.TemporaryDirectory(prefix="hiernav-race-") as folder:
         config = load_config(arguments.config, [*settings, f"run_dir={json.dumps(f'{folder}/run')}"])
         torch.set_num_threads(config.threads)
-        trainer = skill_train.SkillTrainer(config, Run.create(config))
+        make = torchrl_learner if arguments.train == "torchrl" else make_learner
+        trainer = SkillTrainer(config, Run.create(config), make=make)
         evaluate, began, outside = trainer._evaluate, time.perf_counter(), 0.0
 
         def timed() -> None:

@@ -37,6 +37,10 @@ class RandomLayouts:
         which, seed = np.random.SeedSequence(self.seed, spawn_key=(row, episode)).generate_state(2)
         return sample_layout(self.worlds[which % len(self.worlds)], int(seed), self.robot_radius)
 
+    def of_seed(self, *seed: int) -> RandomLayouts:
+        """Layouts of the same worlds from another seed, each row from its first episode on."""
+        return RandomLayouts(self.worlds, seed, self.robot_radius)
+
 
 def expert_planner(config: TrainConfig) -> ShortestPathPlanner:
     """The shortest-path planner with the radius and margin of a configuration."""

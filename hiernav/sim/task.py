@@ -96,7 +96,7 @@ class NavigationTask:
         self.recovery: Recovery | None = None
         """Ways out for robots that are stuck; none in training."""
         self._cap = np.iinfo(np.int64).max if max_steps is None else max_steps
-        self._draw = layouts
+        self.layout_source = layouts
         self.layouts: list[Layout] = [None] * self.num_rows  # type: ignore[list-item]
         self._maps: list[OccupancyMap] = [None] * self.num_rows  # type: ignore[list-item]
         self.goal = np.zeros((self.num_rows, 2))
@@ -116,7 +116,7 @@ class NavigationTask:
 
     def draw_from(self, layouts: LayoutSource) -> None:
         """Draw the layouts of future episodes from another source."""
-        self._draw = layouts
+        self.layout_source = layouts
 
     def reset(self, rows: np.ndarray | None = None, layouts: Sequence[Layout] | None = None) -> np.ndarray:
         """Start new episodes in some rows (all by default), in drawn or given layouts.
@@ -127,7 +127,7 @@ class NavigationTask:
         rows = np.arange(self.num_rows) if rows is None else np.asarray(rows)
         if not len(rows):
             return self.observation
-        drawn = [self._draw(int(row)) for row in rows] if layouts is None else list(layouts)
+        drawn = [self.layout_source(int(row)) for row in rows] if layouts is None else list(layouts)
         self.sim.reset(rows, drawn)
         for row, layout in zip(rows, drawn, strict=True):
             self.layouts[row] = layout

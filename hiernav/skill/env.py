@@ -11,6 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hiernav.nav.termination import TerminationReason
+from hiernav.sim.factory import RandomLayouts
 from hiernav.sim.reward import TERMS
 from hiernav.sim.task import NavigationTask
 
@@ -28,6 +29,11 @@ class NavigationEnv(EnvBase):
 
     A step raises `PhysicsDiverged` if a simulation's physics is no longer finite afterwards: nothing is to be learnt
     from a broken robot.
+
+    `set_seed` decides the worlds of all episodes that follow, as `seed` of a configuration does, and nothing else is
+    random: environments of one configuration, such as the workers of a `ParallelEnv`, drive in the same worlds until
+    they are seeded. A task that was made with layouts of one's own keeps these. Closing the environment closes the
+    task's simulations.
     """
 
     def __init__(self, task: NavigationTask) -> None:
@@ -104,4 +110,9 @@ class NavigationEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Worlds are drawn by the task's layout source, which has a seed of its own; nothing else is random."""
+        if seed is not None and isinstance(self.task.layout_source, RandomLayouts):
+            self.task.draw_from(self.task.layout_source.of_seed(seed))
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        super().close(raise_if_closed=raise_if_closed)
+        self.task.sim.close()

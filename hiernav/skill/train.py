@@ -149,11 +149,24 @@ class TorchSkill:
 class SkillTrainer:
     """One training of the skill within a run folder.
 
+    Args:
+        config: what to train.
+        run: to train into.
+        planner: guides the robots; the expert by default.
+        make: makes the learner once torch is seeded: for another loss or algorithm, such as a subclass of `Learner`
+            with an `update` of its own.
+
     Raises:
         RunError: the run's skill is another run's or a bundle's, or there is no room for the replay.
     """
 
-    def __init__(self, config: TrainConfig, run: Run, planner: Planner | None = None) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        run: Run,
+        planner: Planner | None = None,
+        make: Callable[[TrainConfig], Learner] = make_learner,
+    ) -> None:
         self.config, self.run, self.planner = config, run, planner
         if (run.load("skill") or {}).get("imported"):
             raise RunError(
@@ -163,7 +176,7 @@ class SkillTrainer:
         skill = config.skill
         seeds = np.random.SeedSequence((config.seed, 1)).generate_state(1)
         torch.manual_seed(int(seeds[0]))
-        self.learner = make_learner(config)
+        self.learner = make(config)
         self.batches = make_batches(config, self.learner.policy, planner)
         layout, self._robot = skill_layout(config), get_robot(config.robot)
         self._replay_folder = run.path / "skill" / "replay"

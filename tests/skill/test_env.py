@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ pytestmark = pytest.mark.train
 torch = pytest.importorskip("torch")
 pytest.importorskip("torchrl")
 
+from torchrl.envs import SerialEnv  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
 from hiernav.config import load_config  # noqa: E402
@@ -110,3 +112,46 @@ def test_a_rollout_is_not_written_into_by_the_next_one() -> None:
     kept = first.clone()
     env.rollout(20)
     assert (first == kept).all()
+
+
+def worlds_of(env: NavigationEnv) -> list[int]:
+    env.reset()
+    return [layout.seed for layout in env.task.layouts]
+
+
+def test_a_seed_decides_the_worlds_as_that_of_the_configuration_does() -> None:
+    first, second, third = (NavigationEnv(make_task(load_config(None, [f"seed={seed}"]), 3)) for seed in (0, 0, 2))
+    assert worlds_of(first) == worlds_of(second)
+    first.set_seed(1), second.set_seed(2)
+    begun = worlds_of(first)
+    assert not set(begun) & set(worlds_of(second))
+    first.set_seed(1)
+    assert worlds_of(first) == begun, "from its first episode on"
+    first.set_seed(2)
+    assert worlds_of(first) == worlds_of(third)
+
+
+def test_environments_side_by_side_get_worlds_of_their_own_from_one_seed() -> None:
+    def make() -> NavigationEnv:
+        return NavigationEnv(make_task(load_config(), 2))
+
+    both = SerialEnv(2, make)
+    both.set_seed(0)
+    shown = both.reset()["observation"]
+    assert (shown[0] != shown[1]).any(-1).all()
+    both.close()
+
+
+def test_layouts_of_one_s_own_are_not_replaced_by_a_seed() -> None:
+    env, other = env_of(2), env_of(2)
+    env.set_seed(5)
+    assert worlds_of(env) == worlds_of(other)
+
+
+def test_a_closed_environment_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    env = NavigationEnv(make_task(load_config(None, ["threads=2"]), 4))
+    env.rollout(2)
+    assert threading.active_count() > before
+    env.close()
+    assert threading.active_count() == before

@@ -20,9 +20,11 @@ from hiernav.nav.mirror import mirror_of  # noqa: E402
 from hiernav.nav.option import Planner  # noqa: E402
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner, VerifiedPlanner  # noqa: E402
 from hiernav.run import Run, RunError  # noqa: E402
+from hiernav.sim.factory import skill_layout  # noqa: E402
 from hiernav.sim.robots import get_robot  # noqa: E402
 from hiernav.sim.rollout import Episode  # noqa: E402
 from hiernav.skill import train as skill_train  # noqa: E402
+from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, kept, load_actor  # noqa: E402
 
 pytestmark = pytest.mark.train
@@ -371,3 +373,24 @@ def test_another_seed_is_another_run(tmp_path, straight):
     other.train()
     first, second = (run.path / "metrics.jsonl" for run in (straight.run, other.run))
     assert first.read_text().splitlines()[0] != second.read_text().splitlines()[0]
+
+
+def test_a_learner_of_one_s_own_is_what_is_trained_and_driven(tmp_path):
+    class Still(Learner):
+        """Learns nothing but not to move."""
+
+        def update(self, batch):
+            with torch.no_grad():
+                self.actor.head.weight.zero_(), self.actor.head.bias.zero_()
+            return {"loss": batch["next", "reward"].mean()}
+
+    def make(config):
+        return Still(skill_layout(config), get_robot(config.robot).action_dim, SacSettings(hidden=(16, 16)))
+
+    short = ("skill.total_steps=256", "skill.learning_starts=128", "skill.hidden=[16, 16]")
+    run = Run.create(tiny_run.config(tmp_path / "run", *short))
+    trainer = SkillTrainer(run.config, run, make=make)
+    trainer.train()
+    assert type(trainer.learner) is Still and "loss" in metrics_of(tmp_path / "run")[-2]
+    actor = load_actor(run.config, run.load("skill"))
+    assert not TorchSkill(actor)(np.ones((1, 42), dtype=np.float32)).any()
