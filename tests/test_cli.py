@@ -151,7 +151,7 @@ def test_what_a_check_of_a_data_set_does_not_look_at_is_refused(refused, more):
     assert "--check reads what is there: leave out --config, --samples, --world and KEY=VALUE" in line
 
 
-@pytest.mark.parametrize("command", ["world", "train", "evaluate"])
+@pytest.mark.parametrize("command", ["world", "train", pytest.param("evaluate", marks=pytest.mark.train)])
 def test_a_map_without_a_way_from_start_to_goal_is_refused(refused, tmp_path, request, command):
     write_map(tmp_path, np.ones((40, 40), dtype=bool))
     world = "map(hall.yaml)"
@@ -416,6 +416,7 @@ def test_ctrl_c_and_sigterm_stop_training_with_how_to_go_on_and_going_on_works(t
     assert [line["step"] for line in lines if line["stage"] == "evaluation"] == [7680]
 
 
+@pytest.mark.train
 def test_ctrl_c_in_the_middle_of_a_librarys_bookkeeping_is_ctrl_c(tmp_path, capsys, monkeypatch):
     def interrupted(*_: object) -> None:
         try:
@@ -469,6 +470,7 @@ def test_a_negative_seed_is_refused_by_name_and_value(refused, command):
     assert "--seed is -3, it must not be negative" in refused(command, "--bundle", "nowhere", "--seed", -3)
 
 
+@pytest.mark.train
 def test_a_world_that_is_named_twice_is_driven_once(able_bundle, capsys, monkeypatch):
     asked: list[list[str]] = []
 
@@ -494,6 +496,7 @@ def test_curves_of_a_kind_that_cannot_be_drawn_are_refused_before_the_report_is_
     assert not out.exists()
 
 
+@pytest.mark.train
 def test_a_data_set_that_is_not_there_leaves_no_run_folder(refused, tmp_path):
     run = tmp_path / "run"
     assert "data" in refused("train", "--stage", "planner", "planner.data=nowhere", f"run_dir={run}")

@@ -15,6 +15,7 @@ from hiernav.report.paper import TABLE3, best_of_table3
 
 ROOT = Path(__file__).parents[1]
 ROBOTS = ("point", "car", "doggo")
+NEEDS_TRAIN = re.compile(r"gymnasium|torchrl|hiernav\.training")
 
 
 def driven(robot: str, world: str) -> dict[str, Any]:
@@ -84,7 +85,10 @@ def test_there_are_snippets() -> None:
     assert len(snippets()) == 5
 
 
-@pytest.mark.parametrize("code", snippets())
+@pytest.mark.parametrize(
+    "code",
+    [pytest.param(code, marks=[pytest.mark.train] if NEEDS_TRAIN.search(code) else []) for code in snippets()],
+)
 def test_a_snippet_of_the_readme_runs(code: str) -> None:
     command = [sys.executable, "-W", "error::DeprecationWarning:hiernav", "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)

@@ -78,6 +78,8 @@ class Recorder(Observer):
         except (OSError, RuntimeError) as error:  # the latter where the system has no room for another thread
             with suppress(OSError):  # what was not written still is not
                 self._file.close()
+            if hasattr(self, "_indices"):
+                self._indices.close()
             if new:
                 self.path.unlink(missing_ok=True)
             why = getattr(error, "strerror", None) or error

@@ -9,12 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import TensorProto, helper
-from small_bundle import (
+
+from hiernav.nav import bundle as b
+from hiernav.nav.observation import ObservationLayout, ObservationTerm
+from hiernav.nav.onnx_file import OnnxFileError, inspect_onnx
+
+onnx = pytest.importorskip("onnx", reason="needs the extra hiernav[train]")
+
+from onnx import TensorProto, helper  # noqa: E402
+from small_bundle import (  # noqa: E402
     LAYOUT,
     ROBOT,
     ROBOT_SHA,
@@ -25,10 +31,6 @@ from small_bundle import (
     value,
     write_bundle,
 )
-
-from hiernav.nav import bundle as b
-from hiernav.nav.observation import ObservationLayout, ObservationTerm
-from hiernav.nav.onnx_file import OnnxFileError, inspect_onnx
 
 
 @pytest.fixture

@@ -4,13 +4,23 @@ import json
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
-from small_bundle import CHANNELS, LAYOUT, model_bytes, planner_bytes, skill_bytes, value, write_bundle
 
 from hiernav.nav import bundle as b
 from hiernav.runtime.policy import OnnxPlannerNetwork, OnnxSkill, check_golden, load_networks
+
+onnx = pytest.importorskip("onnx", reason="needs the extra hiernav[train]")
+
+from onnx import TensorProto, helper  # noqa: E402
+from small_bundle import (  # noqa: E402
+    CHANNELS,
+    LAYOUT,
+    model_bytes,
+    planner_bytes,
+    skill_bytes,
+    value,
+    write_bundle,
+)
 
 OBSERVATIONS = np.random.default_rng(0).standard_normal((7, LAYOUT.size)).astype(np.float32)
 

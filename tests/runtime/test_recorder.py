@@ -4,6 +4,7 @@ import errno
 import gc
 import json
 import math
+import os
 import threading
 import tracemalloc
 from dataclasses import replace
@@ -42,9 +43,11 @@ def test_a_recording_that_cannot_begin_says_which_and_spends_no_name(tmp_path, m
             raise OSError(errno.ENOSPC, "No space left on device")
 
         monkeypatch.setattr(recorder.Writer, "start", full)
-    with pytest.raises(OSError, match=f"{path}: the recording cannot be written: No space left on device"):
+    descriptors = os.listdir("/proc/self/fd")
+    with pytest.raises(OSError, match=f"{path}: the recording cannot be written: No space left on device") as caught:
         Recorder(path)
     assert path.exists() == (how == "a device")
+    assert os.listdir("/proc/self/fd") == descriptors, caught  # which holds the recorder: nobody else closes its files
 
 
 def test_what_was_told_is_what_is_read_bit_for_bit(recorded):

@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-import onnx
 import pytest
-from onnx import numpy_helper
 from recorded_drive import BUNDLE, Operator, about, drive, serve
 
 from hiernav import cli
@@ -231,10 +229,12 @@ def test_a_changed_sensor_value_shows_in_the_estimate(tmp_path, bundle):
 
 
 def test_other_policies_are_found_out_at_their_first_other_action(tmp_path, bundle):
+    onnx = pytest.importorskip("onnx", reason="needs the extra hiernav[train]")
     log = recorded(tmp_path / "run.mcap", {"seed": 1, "max_steps": 20})
     model = onnx.load_from_string(bundle.skill)
     weight = max(model.graph.initializer, key=lambda tensor: len(tensor.raw_data))
-    weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * np.float32(1.001), weight.name))
+    changed = onnx.numpy_helper.to_array(weight) * np.float32(1.001)
+    weight.CopyFrom(onnx.numpy_helper.from_array(changed, weight.name))
     skill = model.SerializeToString()
     golden = dict(bundle.golden) | {"action": OnnxSkill(skill)(bundle.golden["observation"])}
     manifest = msgspec.structs.replace(bundle.manifest, files={**bundle.manifest.files, "skill.onnx": "0" * 64})

@@ -18,7 +18,7 @@ TETRAHEDRON = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
 
 def outline_of(kind: str, rotation: Rotation, where: tuple[float, float, float] = (1.0, -2.0, 0.5)) -> np.ndarray:
     spec = mujoco.MjSpec()
-    quaternion = rotation.as_quat(scalar_first=True)
+    quaternion = np.roll(rotation.as_quat(), 1)  # MuJoCo's has the scalar first
     body = spec.worldbody.add_body(name="robot", pos=where, quat=quaternion)
     body.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"), size=SIZES[kind])
     model = spec.compile()

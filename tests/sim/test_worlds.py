@@ -107,7 +107,7 @@ def test_the_paper_s_names_are_canonical(name: str) -> None:
         ("four-room(1,2)", "W = 1 m, it must be between 1.4"),
         ("pillar(2,2,10", "unknown"),
         ("map(none.yaml)", "none.yaml.*cannot be read"),
-        ("map(no\0ne.yaml)", "no.x00ne.yaml.*cannot be read .embedded null byte"),
+        ("map(no\0ne.yaml)", "no.x00ne.yaml.*cannot be read .*embedded null"),
         ("none.yaml", "none.yaml.*cannot be read"),
     ],
 )
