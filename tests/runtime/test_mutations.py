@@ -54,6 +54,7 @@ MUTANTS = (
     Mutant("stop", WATCH, "math.hypot(*estimate.velocity.tolist()) < speed", "True", f"{T}/test_driver.py"),
     Mutant("adapter", f"{R}/robot.py", "if now - self._fed_at <= self.timeout:", "if True:",
            f"{F}/test_21_control_process_gone.py"),
+    Mutant("adapter before the loop", f"{R}/realtime.py", "if above:", "if False:", f"{T}/test_realtime.py"),
     Mutant("old command", f"{R}/robot_process.py", "fresh = now - given <= self.watchdog.timeout", "fresh = True",
            f"{T}/test_process_robot.py::test_a_command_counts_from_when_it_was_given_and_an_old_one_is_not_followed"),
     Mutant("adapter that fails", f"{R}/robot_process.py", "failures += self._brake_for(last_brakes)", "pass",
