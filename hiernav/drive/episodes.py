@@ -96,7 +96,7 @@ class Episodes:
         with ExitStack() as opened:  # a start that fails leaves nothing behind, and spends no recording's name
             self.server = ControlServer(self.driver, arguments.control or default_socket()) if serves else None
             if self.server is not None:
-                opened.callback(_hang_up, self.server)
+                opened.callback(self.server.close)
             self.page = None if faulty is None else _open_page(arguments, self.driver, faulty, spec)
             if self.page is not None:
                 opened.callback(self.page.close)
@@ -261,11 +261,6 @@ class Episodes:
                 finally:
                     with suppress(OSError):
                         unfinished.unlink()
-
-
-def _hang_up(server: ControlServer) -> None:
-    """Close and remove a socket at which nobody has listened yet."""
-    server.close()
 
 
 def _open_recorder(arguments: argparse.Namespace, driver: Driver, bundle: Bundle, spec: RobotSpec) -> Recorder | None:
