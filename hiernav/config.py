@@ -7,6 +7,7 @@ What a trained network depends on is written into its bundle at export: the runt
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +18,7 @@ from hiernav.decode import ConfigError, FieldHelp, decode, describe, dump_yaml, 
 
 __all__ = [
     "ConfigError", "OptionConfig", "PlannerConfig", "RewardConfig", "SkillConfig", "TrainConfig",
-    "check_config", "describe_config", "dump_config", "load_config",
+    "as_overrides", "check_config", "describe_config", "differences", "dump_config", "load_config",
 ]  # fmt: skip
 
 _WORLD_PATTERN = r"^(pillar\([^()]+\)|(gremlin|two-room|four-room)(\([^()]+\))?|map\(.+\)|.+\.ya?ml)$"
@@ -328,6 +329,28 @@ def load_config(path: str | Path | None = None, overrides: list[str] | None = No
 def dump_config(config: TrainConfig) -> str:
     """YAML with every value spelled out; `load_config` reads it back equal, whatever the presets become."""
     return dump_yaml(msgspec.to_builtins(config))
+
+
+def differences(config: TrainConfig, reference: TrainConfig | None = None) -> dict[str, Any]:
+    """What a configuration sets differently from another, or the defaults: "skill.total_steps" -> 100000."""
+    ours, others = msgspec.to_builtins(config), msgspec.to_builtins(reference or TrainConfig())
+    found: dict[str, Any] = {}
+    for key, value in ours.items():
+        if isinstance(value, dict):
+            found |= {f"{key}.{k}": v for k, v in value.items() if v != others[key][k]}
+        elif value != others[key] and key != "run_dir":
+            found[key] = value
+    return found
+
+
+def as_overrides(config: TrainConfig) -> list[str]:
+    """What to hand to `load_config` to get this configuration again, but for its `run_dir`."""
+    sections: dict[str, Any] = {"planner": config.planner, "skill": config.skill, "reward": config.reward}
+    presets = [f"{name}.preset={section.preset}" for name, section in sections.items()]
+    if all(preset.endswith("=default") for preset in presets):
+        presets = []
+    rest = differences(config, load_config(None, presets))
+    return presets + [f"{key}={json.dumps(value)}" for key, value in rest.items()]
 
 
 def describe_config() -> list[FieldHelp]:

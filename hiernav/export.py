@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ import torch
 from torch import nn
 
 from hiernav import __version__
-from hiernav.config import TrainConfig
+from hiernav.config import TrainConfig, as_overrides
 from hiernav.nav import goselo
 from hiernav.nav.bundle import (
     PLANNER,
@@ -254,6 +255,8 @@ def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
     values = {
         "hiernav": __version__,
         "torch": torch.__version__.split("+")[0],
+        "code": ", ".join(run.codes()) or "unknown",
+        "settings": shlex.join(as_overrides(run.config)),
         "seed": run.config.seed,
         "skill_steps": int(states["skill"]["steps"]),
         "skill_updates": int(states["skill"]["learner"]["updates"]),

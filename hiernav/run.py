@@ -6,6 +6,7 @@
     tensorboard/      both as curves
     planner/, skill/  checkpoints of the two stages
     summary.json      outcome
+    commits.txt       which code trained, a line each
     .lock             empty; locked by the process that writes to the folder
 
 A checkpoint knows how long both logs were when it was written; resuming cuts off what came later, so that a resumed
@@ -29,6 +30,7 @@ from typing import Any
 
 from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
 from hiernav.files import sync, write_atomically, write_json
+from hiernav.git import code_name, package_state
 from hiernav.lock import FolderLock
 
 
@@ -39,6 +41,8 @@ class RunError(ValueError):
 class TrainingDiverged(RuntimeError):
     """Losses, weights or physics are no longer finite; the last checkpoint is from before."""
 
+
+COMMITS = "commits.txt"
 
 _LOGS = {"metrics_length": "metrics.jsonl", "rates_length": "rates.jsonl"}
 """Key of a checkpoint -> log whose length it holds."""
@@ -101,6 +105,23 @@ class Run:
     def log(self, stage: str, step: int, values: Mapping[str, float]) -> None:
         """Append values to `metrics.jsonl`, null where one is not known yet, and to the curves `stage/...`."""
         self._append("metrics.jsonl", stage, step, values, stage)
+
+    def note_code(self, code: str | None = None) -> None:
+        """Note which code trains in this process, as `hiernav.git.code_name` gives it; None: ask git.
+
+        Raises:
+            RunError: it cannot be written.
+        """
+        code = code or code_name(package_state())
+        with self.writing():
+            if code not in self.codes():
+                with (self.path / COMMITS).open("a") as file:
+                    file.write(f"{code}\n")
+
+    def codes(self) -> list[str]:
+        """Which code has trained, as far as it was noted; each once, in order."""
+        file = self.path / COMMITS
+        return file.read_text().splitlines() if file.exists() else []
 
     def start_clock(self, stage: str) -> None:
         """Count the seconds of a stage from here on, after those that other processes have spent on it."""

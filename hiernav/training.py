@@ -20,13 +20,14 @@ from hiernav.skill import train as skill_train
 _LINE_SECONDS = 30.0
 
 
-def train(run: Run, stage: str = "all", progress: Progress | None = None) -> None:
+def train(run: Run, stage: str = "all", progress: Progress | None = None, code: str | None = None) -> None:
     """Train "planner", "skill" or "all" of a run, from its last checkpoints on.
 
     Args:
         run: to train into; `Run.create` begins one, `Run.open` goes on with one.
         stage: what to train.
         progress: to show how far it is; None: it is silent.
+        code: see `Run.note_code`.
 
     Raises:
         KeyboardInterrupt: somebody pressed Ctrl-C, whatever a library that was interrupted made of it.
@@ -35,7 +36,7 @@ def train(run: Run, stage: str = "all", progress: Progress | None = None) -> Non
         ConfigError: see `hiernav.run.check_stage`.
     """
     try:
-        _train(run, stage, progress or Progress(disable=True, console=Console(quiet=True)))
+        _train(run, stage, progress or Progress(disable=True, console=Console(quiet=True)), code)
     except Exception as error:
         # what tensordict does in the middle of its bookkeeping fails otherwise where it is interrupted
         cause: BaseException | None = error
@@ -46,11 +47,11 @@ def train(run: Run, stage: str = "all", progress: Progress | None = None) -> Non
         raise
 
 
-def _train(run: Run, stage: str, progress: Progress) -> None:
+def _train(run: Run, stage: str, progress: Progress, code: str | None) -> None:
     torch.set_num_threads(run.config.threads)
     if run.config.skill.preset == "baseline":
         check_stage(run.config, stage)
-        return _train_skill(run, None, progress)
+        return _train_skill(run, None, progress, code)
     planner = planner_train.PlannerTrainer(run.config, run)
     done = planner.resume()
     check_stage(run.config, stage, planner.finished)
@@ -60,6 +61,7 @@ def _train(run: Run, stage: str, progress: Progress) -> None:
         _say_finished(progress, stage)
     if stage in ("planner", "all") and not planner.finished:
         run.start_clock("planner")
+        run.note_code(code)
         planner.train(_PlannerDisplay(progress))
         run.summarize({"planner": {**planner.validation, "seconds": round(run.seconds("planner"), 1)}})
     if stage in ("skill", "all"):
@@ -68,16 +70,18 @@ def _train(run: Run, stage: str, progress: Progress) -> None:
             guide = planner_train.torch_planner(planner.network.cpu(), planner.labels)
             if run.config.skill.preset != "paper":
                 guide = VerifiedPlanner(guide, expert_planner(run.config), get_robot(run.config.robot).radius)
-        _train_skill(run, guide, progress)
+        _train_skill(run, guide, progress, code)
 
 
-def _train_skill(run: Run, guide: Planner | None, progress: Progress) -> None:
+def _train_skill(run: Run, guide: Planner | None, progress: Progress, code: str | None) -> None:
     skill = skill_train.SkillTrainer(run.config, run, guide)
     steps = skill.resume()
     if steps is not None and not skill.finished:
         _say_resumed(progress, run, "skill", f"step {steps:,} of {run.config.skill.total_steps:,}")
     if skill.finished:
         _say_finished(progress, "skill")
+    else:
+        run.note_code(code)
     run.start_clock("skill")
     skill.train(_SkillDisplay(progress))
     shipped = skill_train.kept(skill.evaluations, run.config.skill.eval_episodes)

@@ -351,6 +351,7 @@ def test_going_on_with_a_finished_run_changes_nothing(trained_run, tmp_path, cap
     after = contents(run)
     assert {name for name in after if after[name] != before.get(name)} <= {"summary.json"}  # how long it took
     assert before.keys() == after.keys()
+    assert (run / "commits.txt").read_text() == (trained_run / "commits.txt").read_text()
     assert f"hiernav export --run {run} --onnx" in capsys.readouterr().out
 
 

@@ -20,6 +20,7 @@ from hiernav.config import (
     RewardConfig,
     SkillConfig,
     TrainConfig,
+    as_overrides,
     check_config,
     describe_config,
     dump_config,
@@ -358,6 +359,13 @@ def test_a_written_configuration_reads_back_equal(
     path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
     path.write_text(dump_config(config), encoding="utf-8", newline="")
     assert load_config(path) == config
+
+
+@given(configs())
+def test_a_configuration_said_as_overrides_reads_back_equal_but_for_its_folder(config: TrainConfig) -> None:
+    overrides = as_overrides(config)
+    assert load_config(None, overrides) == msgspec.structs.replace(config, run_dir=None)
+    assert not as_overrides(TrainConfig())
 
 
 @given(st.text(alphabet=st.sampled_from("seedkil:num_vs-[]{}&*!|>'\"#%@`,.?~10 \n\t"), max_size=60))

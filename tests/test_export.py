@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import tiny_run
@@ -14,8 +16,10 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 onnx = pytest.importorskip("onnx", reason="needs the extra hiernav[train]")
 
 from hiernav import export  # noqa: E402
+from hiernav.config import load_config  # noqa: E402
 from hiernav.evaluate import Policies, make_planner, open_policies  # noqa: E402
 from hiernav.export import export_run, record_inputs  # noqa: E402
+from hiernav.git import code_name, package_state  # noqa: E402
 from hiernav.nav.bundle import HASHED_FILES, MANIFEST, BundleError, file_sha256, load_bundle  # noqa: E402
 from hiernav.nav.option import Planner, PlanQuery  # noqa: E402
 from hiernav.planner.train import load_network  # noqa: E402
@@ -143,6 +147,18 @@ def test_the_manifest_holds_what_the_networks_assume(able_bundle, able_run):
     assert manifest.plan.soft_margin_m == config.planner.soft_margin_m
     assert load_bundle(able_bundle).layout == get_robot("point").observation_layout()
     assert manifest.provenance["skill_steps"] == 768 and manifest.provenance["seed"] == 3
+
+
+def test_the_manifest_tells_which_code_trained_and_with_which_settings(able_run, tmp_path):
+    run = Run.open(shutil.copytree(able_run, tmp_path / "run"))
+    (began,) = run.codes()
+    assert began == code_name(package_state())
+    for code in ("abc with changes", began, "abc with changes"):
+        run.note_code(code)
+    run.close()
+    provenance = load_bundle(export_run(run.path, tmp_path / "bundle")).manifest.provenance
+    assert provenance["code"] == f"{began}, abc with changes"
+    assert load_config(None, shlex.split(provenance["settings"])) == msgspec.structs.replace(run.config, run_dir=None)
 
 
 def test_the_manifest_holds_the_rule_and_the_plans_as_they_were_configured(able_run, tmp_path, monkeypatch):

@@ -36,6 +36,7 @@ def measure(
     episodes: int = 1000,
     threads: int = 2,
     settings: Sequence[str] = (),
+    code: str | None = None,
     on_progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Train one planner, or go on training it, and walk.
@@ -46,6 +47,7 @@ def measure(
         preset: "paper" or "default".
         robot: whose radius the disc has.
         settings: further ones of the training.
+        code: see `Run.note_code`.
         on_progress: called with "data set" or "training", what is done and the total.
     """
 
@@ -65,6 +67,7 @@ def measure(
     trainer = PlannerTrainer(run.config, run)
     trainer.resume()
     run.start_clock("planner")
+    run.note_code(code)
     total = config.planner.epochs * samples
     trainer.train(lambda now: show("training", now.done, total) if now.stage == "training" else None)
     run.close()

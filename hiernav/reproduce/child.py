@@ -11,9 +11,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
+from hiernav.git import Code
 from hiernav.orphans import end_with_parent
 from hiernav.reproduce.cells import Cell, Places
-from hiernav.reproduce.results import Code
 from hiernav.reproduce.work import Outcome, Report, run_cell
 
 _PATIENCE = 20.0

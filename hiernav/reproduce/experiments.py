@@ -347,18 +347,6 @@ def _load(file: Path, changed: int, overrides: tuple[str, ...]) -> TrainConfig:
     return load_config(file, list(overrides))
 
 
-def differences(config: TrainConfig) -> dict[str, Any]:
-    """What a configuration sets differently from the defaults: "skill.total_steps" -> 100000."""
-    ours, defaults = msgspec.to_builtins(config), msgspec.to_builtins(TrainConfig())
-    found: dict[str, Any] = {}
-    for key, value in ours.items():
-        if isinstance(value, dict):
-            found |= {f"{key}.{k}": v for k, v in value.items() if v != defaults[key][k]}
-        elif value != defaults[key] and key != "run_dir":
-            found[key] = value
-    return found
-
-
 def _fixed(period: int) -> dict[str, Any]:
     """Settings with which plans are replaced every so many steps, whatever the map shows."""
     return {"period": period, "invalid": False}

@@ -12,17 +12,15 @@ from typing import Literal
 
 import msgspec
 
+from hiernav.git import Code, code_differs, git_state
 from hiernav.lock import try_lock
 from hiernav.reproduce.cells import TRAINING, Cell, Places, cell_key, training_hash
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS
 from hiernav.reproduce.results import (
-    Code,
     Machine,
     Result,
     ResultError,
-    code_differs,
-    git_state,
     read_result,
     this_machine,
     write_result,
@@ -155,7 +153,7 @@ class Queue:
         self.cells, self.places = list(cells), places
         self._execute = execute
         self._machine = this_machine()
-        self._commit, self._dirty = git_state(places.root, places.results)
+        self._commit, self._dirty = self._git_state()
         self.estimate = Estimates(self.entries(), self._machine, places)
 
     def entries(self) -> list[Entry]:
@@ -248,10 +246,14 @@ class Queue:
     def _code(self) -> Code:
         """Commit of a cell that starts now, and whether it runs other code: what drives was loaded with the queue, what
         trains is read when a cell starts."""
-        commit, dirty = git_state(self.places.root, self.places.results)
+        commit, dirty = self._git_state()
         if commit is None or self._commit is None:
             return commit, dirty
         return commit, dirty or self._dirty or code_differs(self.places.root, self._commit, commit)
+
+    def _git_state(self) -> Code:
+        """Of the repository, results apart: they change while the queue runs."""
+        return git_state(self.places.root, (self.places.root / "results", self.places.results))
 
     def _why_not(self, cell: Cell, left: float | None) -> str | None:
         """Why a cell cannot be started, if so."""

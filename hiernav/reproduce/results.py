@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import platform
-import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,9 +13,6 @@ import msgspec
 
 from hiernav import __version__
 from hiernav.files import write_atomically
-
-Code = tuple[str | None, bool | None]
-"""What a process runs: the commit, and whether it is other code than that; None and None where there is no git."""
 
 _PACKAGES = ("numpy", "mujoco", "onnxruntime", "torch", "torchrl")
 
@@ -225,28 +221,6 @@ def this_machine() -> Machine:
             pass
     system = f"{platform.system()} {platform.machine()}"
     return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions)
-
-
-def git_state(root: Path, results: Path) -> Code:
-    """Commit of a repository and whether tracked files differ from it, results apart; None and None without git."""
-    folders = {root / "results", results}
-    excluded = [f":(exclude){folder.relative_to(root)}" for folder in folders if folder.is_relative_to(root)]
-    try:
-        commit = _git(root, "rev-parse", "HEAD").strip()
-        changes = _git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *excluded)
-    except (OSError, subprocess.CalledProcessError):
-        return None, None
-    return commit, bool(changes.strip())
-
-
-def code_differs(root: Path, before: str, after: str) -> bool:
-    """Whether the package is not the same in two commits."""
-    return before != after and bool(_git(root, "diff", "--name-only", before, after, "--", "hiernav").strip())
-
-
-def _git(root: Path, *arguments: str) -> str:
-    done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
-    return done.stdout
 
 
 def _cpu() -> str:

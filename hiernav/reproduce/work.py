@@ -15,15 +15,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hiernav.config import OptionConfig, RewardConfig, TrainConfig, load_config
+from hiernav.config import OptionConfig, RewardConfig, TrainConfig, differences, load_config
 from hiernav.evaluate import Policies, evaluate, evaluate_plans, open_policies, summarize, under_protocol
 from hiernav.film.film import FilmSettings, make_film
 from hiernav.film.writer import default_suffix
+from hiernav.git import Code, code_name
 from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key, training_hash
-from hiernav.reproduce.experiments import differences
-from hiernav.reproduce.results import Code
-from hiernav.run import spent_seconds
+from hiernav.run import Run, spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 
@@ -31,8 +30,6 @@ Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done."""
 
 EVALUATION_SEED = 0
-
-_COMMITS = "commits.txt"
 
 WALKERS = {"network": ("cnn", False), "verified": ("cnn", True), "astar": ("astar", False)}
 """Whose plans are walked along: planner, and whether what collides is repaired."""
@@ -103,28 +100,6 @@ def trained_seconds(cell: Cell, places: Places) -> float:
     """What the training of a cell has taken so far, as its run folder tells."""
     folder, stages = training_of(cell, places)
     return sum(spent_seconds(folder, stage) for stage in stages)
-
-
-def _noting_commit(folder: Path, code: Code, report: Report) -> Report:
-    """`report`, which before it first says something of a training notes in the run folder what trains there."""
-    noted = False
-
-    def note(share: float, what: str) -> None:
-        nonlocal noted
-        if not noted:
-            commit, dirty = code
-            with (folder / _COMMITS).open("a") as file:
-                file.write(f"{commit or 'no repository'}{' with changes' if dirty else ''}\n")
-            noted = True
-        report(share, what)
-
-    return note
-
-
-def _commits(folder: Path) -> list[str]:
-    """Of the processes that trained in a run folder, as far as they noted it; each once, in order."""
-    file = folder / _COMMITS
-    return list(dict.fromkeys(file.read_text().splitlines())) if file.exists() else []
 
 
 def driven(
@@ -222,15 +197,13 @@ def _fine_tune(cell: Cell, places: Places, report: Report, code: Code) -> Outcom
         shutil.rmtree(folder, ignore_errors=True)  # begun by an older version and killed: nothing to go on with
         overrides = [f"planner.worlds={json.dumps([cell.world])}", _run_dir(folder), f"seed={cell.seed or 0}"]
         begin_fine_tuning(fine_tuning_config(source, [*overrides, *cell.settings["fine_tuning"]]), source).close()
-    _train_run(folder, "planner", _noting_commit(folder, code, report))
+    _train_run(folder, "planner", report, code)
     metrics = driven(open_policies(folder), cell.world, cell.settings, report)
-    return Outcome(metrics, {**about, "fine_tuned": folder.name, "commits": _commits(folder)}, cell.settings)
+    return Outcome(metrics, {**about, "fine_tuned": folder.name, "commits": Run.open(folder).codes()}, cell.settings)
 
 
 def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     """Train the skill, then drive with A* plans; or train the planner of a run whose skill is trained."""
-    from hiernav.run import Run
-
     assert cell.run is not None and cell.config is not None
     folder, stage = training_of(cell, places)[0], cell.settings["stage"]
     if not (folder / "config.yaml").exists():
@@ -238,7 +211,7 @@ def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
         given = folder / "given.yaml"
         given.write_text(cell.config)
         Run.create(load_config(given, [_run_dir(folder)])).close()
-    _train_run(folder, stage, _noting_commit(folder, code, report))
+    _train_run(folder, stage, report, code)
     if stage == "planner":
         curves = {"planner": _curve(folder, "planner")}
         metrics: dict[str, Any] = {"last": curves["planner"][-1]}
@@ -250,7 +223,7 @@ def _train(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
         best = json.loads((folder / "summary.json").read_text())["skill"]
         found = driven(open_policies(folder), cell.world or "", settings, report, reward)
         metrics = {"best": {key: value for key, value in best.items() if key != "seconds"}, **found}
-    source = {"run": cell.run, "commits": _commits(folder)}
+    source = {"run": cell.run, "commits": Run.open(folder).codes()}
     config = Run.open(folder).config
     computed = {key: value for part in training_of(cell, places)[1] for key, value in _computed(config, part).items()}
     return Outcome(metrics, source, {**cell.settings, **differences(config), **computed}, curves)
@@ -272,14 +245,14 @@ def _table2(cell: Cell, places: Places, report: Report, code: Code) -> Outcome:
     assert cell.world is not None and cell.seed is not None
     wanted = cell.settings
     folder, (run, _) = places.runs / "table2", training_of(cell, places)
-    tell = _noting_commit(run, code, report)
 
     def show(what: str, done: int, total: int) -> None:
-        tell(done / total, f"{what}: {done:,} of {total:,}")
+        report(done / total, f"{what}: {done:,} of {total:,}")
 
     more = {"world": cell.world, "episodes": wanted["episodes"], "settings": wanted.get("settings", ())}
+    more["code"] = code_name(code)
     found = measure(folder, wanted["samples"], wanted["preset"], cell.seed, **more, on_progress=show)
-    return Outcome(found, {"run": "table2", "commits": _commits(run)}, wanted)
+    return Outcome(found, {"run": "table2", "commits": Run.open(run).codes()}, wanted)
 
 
 def _walk(cell: Cell, places: Places, report: Report) -> Outcome:
@@ -320,12 +293,11 @@ def _run_dir(folder: Path) -> str:
     return f"run_dir={json.dumps(str(folder))}"
 
 
-def _train_run(folder: Path, stage: str, report: Report) -> None:
+def _train_run(folder: Path, stage: str, report: Report, code: Code) -> None:
     """Train a stage of a run folder from its last checkpoint on."""
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from hiernav.run import Run
     from hiernav.training import train
 
     class Reporting(Progress):
@@ -338,7 +310,7 @@ def _train_run(folder: Path, stage: str, report: Report) -> None:
 
     run = Run.open(folder)
     try:
-        train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True))
+        train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True), code_name(code))
     finally:
         run.close()
 

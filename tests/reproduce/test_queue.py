@@ -14,12 +14,13 @@ import msgspec
 import pytest
 
 from hiernav.finetune import DEFAULTS
+from hiernav.git import git_state
 from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Places, cell_key, training_hash
 from hiernav.reproduce.child import CellFailed
 from hiernav.reproduce.experiments import EXPERIMENTS, FULL, ROBOTS, SMOKE, catalogue
 from hiernav.reproduce.queue import Queue, duration, look_up, select
-from hiernav.reproduce.results import ResultError, git_state, read_result, read_results, result_path, write_result
+from hiernav.reproduce.results import ResultError, read_result, read_results, result_path, write_result
 from hiernav.reproduce.work import Outcome
 
 ROOT = Path(__file__).parents[2]
@@ -142,7 +143,7 @@ def test_a_result_knows_its_commit_and_whether_code_was_changed(places):
         command = ["git", "-C", str(places.root), "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    assert git_state(places.root, places.results) == (None, None)
+    assert git_state(places.root) == (None, None)
     (places.root / "results").mkdir()
     for name in ("code.py", "results/a.json"):
         (places.root / name).write_text("1")
@@ -151,9 +152,10 @@ def test_a_result_knows_its_commit_and_whether_code_was_changed(places):
     git("commit", "-q", "-m", "x")
     (places.root / "results/a.json").write_text("2")
     (places.root / "new.py").write_text("2")
-    assert git_state(places.root, places.root / "elsewhere") == (git("rev-parse", "HEAD"), False)
+    apart = [places.root / "results", places.root.parent / "elsewhere"]
+    assert git_state(places.root, apart) == (git("rev-parse", "HEAD"), False)
     (places.root / "code.py").write_text("2")
-    assert git_state(places.root, places.results) == (git("rev-parse", "HEAD"), True)
+    assert git_state(places.root, apart) == (git("rev-parse", "HEAD"), True)
 
 
 def test_a_result_has_the_commit_at_which_its_cell_started(places):
