@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hiernav.config import ConfigError, TrainConfig
+from hiernav.nav.mirror import mirror_of
 from hiernav.planner.mix import WorldRange
 from hiernav.run import check_stage
-from hiernav.sim.factory import expert_planner
+from hiernav.sim.factory import expert_planner, skill_layout
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.scene import scene_for
@@ -32,6 +33,8 @@ def check_training(config: TrainConfig, stage: str = "all", overrides: Sequence[
     check_stage(config, stage)
     check_worlds(config)
     _check_scene(config)
+    if stage != "planner":
+        _check_mirror(config)
     _check_machine(config)
     return _with_worlds_of_data(config, overrides)
 
@@ -70,6 +73,18 @@ def _check_scene(config: TrainConfig) -> None:
         scene_for([parse_world(text) for text in config.skill.worlds])
     except ValueError as error:
         raise ConfigError(f"skill.worlds = {list(config.skill.worlds)}: {error}") from None
+
+
+def _check_mirror(config: TrainConfig) -> None:
+    """Refuse a body that the skill could not be trained in mirrored, before its planner is trained."""
+    if not config.skill.mirror:
+        return
+    try:
+        mirror_of(config.robot, skill_layout(config))
+    except ValueError as error:
+        raise ConfigError(
+            f"skill.mirror = true: {error}; tell hiernav/nav/mirror.py how, or train with skill.mirror=false"
+        ) from None
 
 
 def _check_machine(config: TrainConfig) -> None:

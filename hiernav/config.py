@@ -18,7 +18,8 @@ from hiernav.decode import ConfigError, FieldHelp, decode, describe, dump_yaml, 
 
 __all__ = [
     "ConfigError", "OptionConfig", "PlannerConfig", "RewardConfig", "SkillConfig", "TrainConfig",
-    "as_overrides", "check_config", "describe_config", "differences", "dump_config", "load_config",
+    "as_overrides", "check_config", "deciding_settings", "describe_config", "differences", "dump_config",
+    "load_config",
 ]  # fmt: skip
 
 _WORLD_PATTERN = r"^(pillar\([^()]+\)|(gremlin|two-room|four-room)(\([^()]+\))?|map\(.+\)|.+\.ya?ml)$"
@@ -201,7 +202,7 @@ class OptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class RewardConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Weights of the named reward terms (method section 7)."""
+    """Weights of the named reward terms (method section 7); each is computed in `hiernav.sim.reward`."""
 
     preset: Annotated[
         Literal["default", "paper", "baseline"],
@@ -291,6 +292,10 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 }
 """Section -> preset -> the values that differ from the field defaults."""
 
+NEUTRAL: dict[str, Any] = {"skill.waypoint_frame": "body"}
+"""Settings that came after the first results in `results/`, and the values that say what was done before: with these a
+training is still the one it was. A setting that is added belongs in here, else all trainings count as other ones."""
+
 
 def load_config(path: str | Path | None = None, overrides: list[str] | None = None, begun: bool = False) -> TrainConfig:
     """Read a configuration: preset, then file, then `key.path=value` overrides.
@@ -329,6 +334,17 @@ def load_config(path: str | Path | None = None, overrides: list[str] | None = No
 def dump_config(config: TrainConfig) -> str:
     """YAML with every value spelled out; `load_config` reads it back equal, whatever the presets become."""
     return dump_yaml(msgspec.to_builtins(config))
+
+
+def deciding_settings(config: TrainConfig) -> dict[str, Any]:
+    """All settings but those that are `NEUTRAL`, by section, as plain values: what tells one training from another."""
+    values = msgspec.to_builtins(config)
+    for key, neutral in NEUTRAL.items():
+        section, _, name = key.rpartition(".")
+        within = values[section] if section else values
+        if within[name] == neutral:
+            del within[name]
+    return values
 
 
 def differences(config: TrainConfig, reference: TrainConfig | None = None) -> dict[str, Any]:

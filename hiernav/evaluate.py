@@ -285,10 +285,7 @@ def _from_bundle(path: Path) -> Policies:
             soft_margin_m=manifest.plan.soft_margin_m,
         ),
         option=OptionConfig(
-            d_update_m=manifest.replan.d_update_m,
-            half_fraction=manifest.replan.half_fraction,
-            invalid=manifest.replan.invalid,
-            period=manifest.replan.period,
+            **msgspec.structs.asdict(manifest.replan),
             waypoints=manifest.plan.waypoints,
             spacing_m=manifest.plan.spacing_m,
         ),

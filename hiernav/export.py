@@ -29,7 +29,6 @@ from hiernav.nav.bundle import (
     ObservationField,
     PlannerSpec,
     PlanSpec,
-    ReplanSpec,
     SkillSpec,
     TensorSpec,
     file_sha256,
@@ -45,7 +44,7 @@ from hiernav.planner.network import HypothesisNetwork, PaperNetwork
 from hiernav.planner.train import load_network, torch_planner
 from hiernav.run import Run, RunError
 from hiernav.runtime.policy import check_golden
-from hiernav.sim.factory import make_task, skill_layout
+from hiernav.sim.factory import make_task, replan_spec, skill_layout
 from hiernav.sim.robots import get_robot
 from hiernav.skill.networks import Actor
 from hiernav.skill.train import TorchSkill, kept, load_actor
@@ -165,12 +164,7 @@ def write_bundle(
                 planning_radius_m=planner.planning_radius_m or robot.radius,
                 soft_margin_m=planner.soft_margin_m,
             ),
-            replan=ReplanSpec(
-                d_update_m=option.d_update_m,
-                half_fraction=option.half_fraction,
-                invalid=option.invalid,
-                period=option.period,
-            ),
+            replan=replan_spec(config),
             provenance=provenance,
         ),
     )

@@ -22,6 +22,7 @@ from without_torch import BLOCK
 from hiernav import check, cli
 from hiernav.config import describe_config, load_config
 from hiernav.evaluate import wilson_interval
+from hiernav.nav import mirror
 from hiernav.nav.bundle import file_sha256, load_bundle
 
 COMMANDS = ("train", "evaluate", "watch", "export", "report", "world", "config")
@@ -163,6 +164,17 @@ def test_a_map_without_a_way_from_start_to_goal_is_refused(refused, tmp_path, re
         bundle = request.getfixturevalue("able_bundle")
         line = refused("evaluate", "--bundle", bundle, "--world", world, "--episodes", 1, "--json", "out.json")
     assert "world map(hall.yaml): no place is free for a robot of radius 0.1 m" in line and "use another map" in line
+
+
+@pytest.mark.train
+def test_a_body_without_a_mirror_is_refused_before_its_planner_is_trained(refused, monkeypatch, tmp_path):
+    monkeypatch.delitem(mirror._ROBOTS, "point")
+    line = refused("train", *tiny_run.arguments(tmp_path / "run"))
+    assert "skill.mirror = true: robot 'point' has no known mirror" in line and "skill.mirror=false" in line
+    plain = tiny_run.config(tmp_path / "run", "skill.mirror=false")
+    assert check.check_training(plain) == plain
+    mirrored = tiny_run.config(tmp_path / "run")
+    assert check.check_training(mirrored, "planner") == mirrored, "a planner needs no mirror"
 
 
 def test_a_map_of_two_rooms_without_a_door_still_gives_tasks_within_a_room(tmp_path, capsys):

@@ -27,6 +27,7 @@ from hiernav.config import (
     load_config,
 )
 from hiernav.nav import option
+from hiernav.sim import layout
 from hiernav.sim.robots import get_robot
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -312,6 +313,17 @@ def test_a_configuration_built_in_python_is_checked_too() -> None:
     with pytest.raises(ConfigError, match=r"skill\.num_envs = 0, expected int >= 1"):
         check_config(config)
     assert check_config(TrainConfig()) == TrainConfig()
+
+
+@pytest.mark.parametrize("name", layout.KINDS)
+def test_every_kind_of_world_can_be_configured(name: str) -> None:
+    kind = layout.KINDS[name]
+    texts = [name] if kind.default else []
+    texts.append(f"{name}({','.join('3' for _ in kind.arguments.split(','))})")
+    for text in texts:
+        config = load_config(None, [f'planner.worlds=["2*{text}"]', f'skill.worlds=["{text}"]'])
+        assert config.skill.worlds == (text,) and str(layout.parse_world(text)) == text
+        assert kind.arguments in layout._ACCEPTED
 
 
 def test_a_configuration_cannot_be_changed() -> None:

@@ -55,7 +55,7 @@ ALLOWED = {
         "orphans",
     },
     "report": {"nav", "evaluate", "reproduce", "run", "sim", "files"},
-    "check": {"sim", "planner", "config", "run", "device"},
+    "check": {"nav", "sim", "planner", "config", "run", "device"},
     "commands": {
         "check",
         "nav",

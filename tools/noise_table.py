@@ -22,6 +22,7 @@ import math
 import sys
 import time
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -91,10 +92,15 @@ class RawEstimator:
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.config, self.counts = config, Counter[str]()
+        self.skill_sensors: Mapping[str, int] | None = None
+        self.driven = False
         self.reset()
 
     def reset(self) -> None:
         self._fix: np.ndarray | None = None
+
+    def renew(self) -> None:
+        pass
 
     def silence(self, sensor: str) -> float:
         """As of `Estimator`; here nothing is given where a sensor says nothing."""
@@ -156,7 +162,7 @@ def drive(case: Case, path: str, world: str, seeds: list[int], told: bool) -> di
         Pilot(make_agent(bundle, spec.radius, GOAL_RADIUS, link), link),
         robot.occupancy,
         clock,
-        Estimator(config) if case.filter else RawEstimator(config),  # type: ignore[arg-type]
+        Estimator(config) if case.filter else RawEstimator(config),
         Guard(spec.action_dim, settings.guard.limited(bundle.manifest.guard.slew_limit)),
         replace(settings.driver, max_steps=layouts[0].spec.max_steps),
     )

@@ -21,6 +21,7 @@ import numpy as np
 from hiernav.files import write_atomically
 from hiernav.nav.observation import ObservationLayout, ObservationTerm
 from hiernav.nav.onnx_file import OnnxFacts, OnnxFileError, inspect_onnx
+from hiernav.nav.termination import ReplanRule
 
 FORMAT_VERSION = 1
 PLANNER, SKILL, GOLDEN, MANIFEST = "planner.onnx", "skill.onnx", "golden.npz", "manifest.json"
@@ -108,12 +109,21 @@ class PlanSpec(_Struct, frozen=True):
 
 
 class ReplanSpec(_Struct, frozen=True):
-    """Thresholds of the rule that ends an option."""
+    """Thresholds of the rule that ends an option, named as in `OptionConfig`.
+
+    In training, in an evaluation and on the robot they act through `rule` alone.
+    """
 
     d_update_m: Positive
     half_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
     invalid: bool
     period: Count | None = None
+
+    def rule(self) -> ReplanRule:
+        """The rule of these thresholds."""
+        return ReplanRule(
+            d_update=self.d_update_m, half_fraction=self.half_fraction, invalid=self.invalid, period=self.period
+        )
 
 
 class GuardSpec(_Struct, frozen=True):

@@ -45,21 +45,28 @@ def mirror_of(robot: str, layout: ObservationLayout) -> Mirror:
     """The mirror of a robot's observations in `layout`, and of its actions.
 
     Raises:
-        ValueError: the robot, or a term of its layout, has no known mirror.
+        ValueError: the robot, or a term of its layout, has no known mirror, or one of another size.
     """
-    if robot not in _ACTIONS:
-        raise ValueError(f"robot {robot!r} has no known mirror; known: {', '.join(_ACTIONS)}")
-    terms = {**(_ACROSS_X if robot == "car" else _ACROSS_Y), **_OWN}
-    index, sign, start = [], [], 0
+    if robot not in _ROBOTS:
+        raise ValueError(f"robot {robot!r} has no known mirror; known: {', '.join(_ROBOTS)}")
+    across, (order, signs) = _ROBOTS[robot]
+    terms = {**across, **_OWN}
+    parts = []
     for term in layout.terms:
         if term.name not in terms:
             raise ValueError(f"observation term {term.name!r} has no known mirror")
-        order, signs = terms[term.name]
-        index.append(start + np.asarray(order))
-        sign.append(np.asarray(signs, dtype=np.float32))
-        start += term.size
-    order, signs = _ACTIONS[robot]
-    return Mirror(np.concatenate(index), np.concatenate(sign), np.asarray(order), np.asarray(signs, dtype=np.float32))
+        if len(terms[term.name][0]) != term.size:
+            raise ValueError(
+                f"observation term {term.name!r} has {term.size} values, its mirror {len(terms[term.name][0])}"
+            )
+        parts.append(terms[term.name])
+    starts = np.cumsum([0, *(term.size for term in layout.terms)])
+    return Mirror(
+        np.concatenate([start + np.asarray(own) for start, (own, _) in zip(starts, parts, strict=False)]),
+        np.concatenate([np.asarray(own, dtype=np.float32) for _, own in parts]),
+        np.asarray(order),
+        np.asarray(signs, dtype=np.float32),
+    )
 
 
 Rule = tuple[Sequence[int], Sequence[float]]
@@ -97,4 +104,9 @@ _OWN: dict[str, Rule] = {
     "joint_cos": (_JOINTS, [1.0] * 12),
     "joint_velocity": (_JOINTS, [1.0] * 12),
 }
-_ACTIONS: dict[str, Rule] = {"point": _flip(1, -1), "car": ([1, 0], [1.0, 1.0]), "doggo": (_JOINTS, [1.0] * 12)}
+_ROBOTS: dict[str, tuple[dict[str, Rule], Rule]] = {
+    "point": (_ACROSS_Y, _flip(1, -1)),
+    "car": (_ACROSS_X, ([1, 0], [1.0, 1.0])),
+    "doggo": (_ACROSS_Y, (_JOINTS, [1.0] * 12)),
+}
+"""How what every robot observes is mirrored, `_ACROSS_Y` for one whose forward is x, and its actions."""

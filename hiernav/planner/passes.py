@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from hiernav.config import TrainConfig, load_config
+from hiernav.config import TrainConfig, deciding_settings, load_config
 
 BATCH, UPDATES, EPOCHS = 256, 1_000, 6
 """Every set is seen six times, and small ones until there were 1,000 updates."""
@@ -46,7 +46,8 @@ def configuration(
 def what_decides(config: TrainConfig) -> str:
     """All that decides what a planner's training comes to, its seed apart, as JSON."""
     planner = msgspec.structs.replace(config.planner, data=None)
-    return msgspec.json.encode({"robot": config.robot, "planner": planner, "option": config.option}).decode()
+    values = deciding_settings(msgspec.structs.replace(config, planner=planner))
+    return msgspec.json.encode({key: values[key] for key in ("robot", "planner", "option")}).decode()
 
 
 def digest(text: str) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from hiernav.config import PRESETS, RewardConfig, TrainConfig, load_config
+from hiernav.config import PRESETS, RewardConfig, TrainConfig, deciding_settings, load_config
 from hiernav.film.film import film_name
 from hiernav.finetune import DEFAULTS
 from hiernav.planner import passes
@@ -89,8 +89,6 @@ TRAINING = {
 nothing for a robot is left out for it."""
 OF_LEGS = ("no-tilt-cost", "go-on-after-fall", "no-clock", "no-time-cost")
 """Departures that are left out with the quadruped instead."""
-NEUTRAL = {"waypoint_frame": "body"}
-"""Settings of the skill that came after the first results, and the values that say what was done before."""
 _BASELINE_REWARD = msgspec.structs.asdict(RewardConfig()) | PRESETS["reward"]["baseline"]
 BASELINE = [
     "skill.preset=baseline", "skill.reward_scale=1.0",
@@ -278,9 +276,7 @@ class _Maker:
     def _config(self, seed: int, overrides: list[str]) -> str:
         file = self.root / "configs" / f"{self.robot}.yaml"
         config = _load(file, file.stat().st_mtime_ns, (*overrides, *self.size.training, "run_dir=null"))
-        values = msgspec.to_builtins(msgspec.structs.replace(config, seed=seed))
-        values["skill"] = {key: v for key, v in values["skill"].items() if (key, v) not in NEUTRAL.items()}
-        return msgspec.json.encode(values).decode()
+        return msgspec.json.encode(deciding_settings(msgspec.structs.replace(config, seed=seed))).decode()
 
     def _fine_tuning_config(self, world: str, trained: bool) -> str:
         """What decides a fine-tuning of a trained run, or of the bundle, whose own part its hashes tell."""

@@ -15,7 +15,7 @@ from hiernav.nav.termination import TerminationReason
 from hiernav.runtime.clock import Clock
 from hiernav.runtime.collision import time_to_collision
 from hiernav.runtime.driver_config import DriverConfig
-from hiernav.runtime.estimate import Estimate, Trust
+from hiernav.runtime.estimate import Estimate, StateEstimator, Trust
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.loop import FixedRateLoop, LoopExit, noting_signals
@@ -71,7 +71,7 @@ class Driver:
         pilot: Pilot,
         occupancy: Callable[[float], OccupancyMap],
         clock: Clock,
-        estimator: Estimator | None = None,
+        estimator: StateEstimator | None = None,
         guard: Guard | None = None,
         config: DriverConfig | None = None,
         observers: Sequence[Observer] = (),
@@ -92,7 +92,7 @@ class Driver:
             ValueError: the policies are for another control rate than the robot's, or the guard for other actuators.
         """
         self.robot, self.pilot, self.occupancy, self.clock = robot, pilot, occupancy, clock
-        self.estimator = estimator or Estimator()
+        self.estimator: StateEstimator = estimator or Estimator()
         self.guard = guard or Guard(robot.action_dim)
         self._require_fit()
         self.config = config or DriverConfig()

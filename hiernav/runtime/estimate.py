@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
+
+from hiernav.runtime.robot import SensorFrame
 
 
 class Trust(IntEnum):
@@ -126,3 +131,52 @@ class Estimate:
         (vx, vy), yaw = self.velocity.tolist(), float(self.pose[2])
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return cosine * vx + sine * vy, cosine * vy - sine * vx
+
+
+class StateEstimator(Protocol):
+    """What the `Driver` asks of whatever estimates the state; `Estimator` is the one that ships.
+
+    But for estimates that do not come, nothing else watches the sensors: one that falls silent, freezes or lies must
+    show in `Estimate.trust`, or the robot drives on. `hiernav replay` goes through `Estimator`, and tells at which tick
+    another one said otherwise.
+    """
+
+    skill_sensors: Mapping[str, int] | None
+    """How many values each sensor gives that the skill observes. The driver says so before each `reset`."""
+    driven: bool
+    """Whether the policies have driven the robot since the last frame. The driver says so before each `update`."""
+
+    @property
+    def config(self) -> EstimatorConfig:
+        """Its limits of trust are those of the driver's own watches, too."""
+        ...
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How often something was dropped, rejected or started again, by name, since it was made."""
+        ...
+
+    @property
+    def lacks(self) -> str:
+        """Which sensors keep the first estimate waiting, and what is wrong with them; nothing once there is one."""
+        ...
+
+    def reset(self) -> None:
+        """Forget the state: the loop starts."""
+        ...
+
+    def renew(self) -> None:
+        """Somebody acknowledged a fault."""
+        ...
+
+    def update(self, frame: SensorFrame) -> Estimate | None:
+        """Take in one frame, whatever is in it; the state at the newest stamp, None until it is known."""
+        ...
+
+    def hears(self, sensor: str) -> bool:
+        """Whether a sensor, such as "velocimeter", has ever said something, as far as is known."""
+        ...
+
+    def silence(self, sensor: str) -> float:
+        """For how long a sensor, such as "velocimeter", has said nothing usable [s]; 0 for one never heard of."""
+        ...

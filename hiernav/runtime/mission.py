@@ -11,8 +11,7 @@ import numpy as np
 from hiernav.nav.goal import GoalRefused, place_goal
 from hiernav.nav.occupancy import OccupancyMap
 from hiernav.runtime.driver_config import DriverConfig
-from hiernav.runtime.estimate import Estimate, Trust
-from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.estimate import Estimate, StateEstimator, Trust
 from hiernav.runtime.guard import Guard
 from hiernav.runtime.observe import Audience
 from hiernav.runtime.pilot import Decision, Pilot
@@ -33,7 +32,13 @@ class Mission:
     """
 
     def __init__(
-        self, pilot: Pilot, guard: Guard, estimator: Estimator, config: DriverConfig, audience: Audience, period: float
+        self,
+        pilot: Pilot,
+        guard: Guard,
+        estimator: StateEstimator,
+        config: DriverConfig,
+        audience: Audience,
+        period: float,
     ) -> None:
         """
         Args:

@@ -20,7 +20,6 @@ from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import WAYPOINT_GUIDES
 from hiernav.nav.option import DeferredPlanner, Planner, WaypointOption, refresh_steps
 from hiernav.nav.planners import ShortestPathPlanner, verified_planner
-from hiernav.nav.termination import ReplanRule
 from hiernav.runtime.robot import Robot
 
 GOLDEN_TOLERANCE = 1e-5
@@ -227,11 +226,11 @@ def make_agent(
     Raises:
         BundleError: as `load_networks`.
     """
-    networks, plan, replan = load_networks(bundle), bundle.manifest.plan, bundle.manifest.replan
+    networks, plan = load_networks(bundle), bundle.manifest.plan
     option = WaypointOption(
         planner or make_planner(bundle, networks.planner, robot_radius, goal_radius),
         num_rows=rows,
-        rule=ReplanRule(replan.d_update_m, replan.half_fraction, replan.invalid, replan.period),
+        rule=bundle.manifest.replan.rule(),
         num_waypoints=plan.waypoints,
         goal_radius=goal_radius,
         sweep_radius=robot_radius,

@@ -7,8 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from hiernav.runtime.estimate import Estimate, Trust
-from hiernav.runtime.estimator import Estimator
+from hiernav.runtime.estimate import Estimate, StateEstimator, Trust
 
 
 class BlindWatch:
@@ -224,7 +223,7 @@ class StopWatch:
         self._alike, self._stamp = self._alike + 1, estimate.stamp
 
 
-def measured(estimator: Estimator) -> tuple[bool, bool, bool]:
+def measured(estimator: StateEstimator) -> tuple[bool, bool, bool]:
     """What `StopWatch.check` asks of the sensors behind an estimate: `measured`, `turn_measured` and `sure`."""
     patience = estimator.config.hold_after
     speed, turn = (estimator.silence(name) < patience for name in ("velocimeter", "gyro"))

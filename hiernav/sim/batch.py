@@ -29,8 +29,8 @@ class BatchSim:
         upright (N,): z component of the body's z axis, 1 when it is upright.
         collided (N,) bool: the robot touched an obstacle in any substep of the last control step.
         sensors: name -> (N, d). accelerometer, velocimeter, gyro and magnetometer (3 each, body frame) and the robot's
-            `own_terms`. The former are those of the last substep as MuJoCo leaves them, that is of the state at that
-            substep's start; everything else is of the present state.
+            `own_terms`. Sensors of the model are those of the last substep as MuJoCo leaves them, that is of the state
+            at that substep's start; everything else is of the present state.
         time (N,): since the row's reset [s].
         finite (N,) bool: False where the physics has diverged. Such a row reads NaN and stands still until it is reset.
 
@@ -65,9 +65,8 @@ class BatchSim:
         self._ctrl = [d.ctrl for d in self.datas]
         self._views = [[getattr(d, name) for d in self.datas] for name in ("qpos", "qvel", "sensordata", "history")]
         self._gremlins: dict[int, Layout] = {}
-        self._sensor_columns = {
-            name: slice(self.model.sensor(name).adr[0], self.model.sensor(name).adr[0] + 3) for name in BASE_SENSORS
-        }
+        sizes = dict.fromkeys(BASE_SENSORS, 3) | {term.name: term.size for term in robot.observed_sensors}
+        self._sensor_columns = {name: self._sensor_values(name, size) for name, size in sizes.items()}
         self._contact_columns = [_history_values(self.model, name) for name in CONTACT_SENSORS]
         self._helpers = min(threads, num_envs) - 1
         self._workers = ThreadPoolExecutor(self._helpers, "batch-sim") if self._helpers else None
@@ -136,6 +135,16 @@ class BatchSim:
         """Stop the worker threads. The simulations cannot be stepped afterwards."""
         if self._workers is not None:
             self._workers.shutdown()
+
+    def _sensor_values(self, name: str, size: int) -> slice:
+        """Where the values of a sensor lie in `MjData.sensordata`; KeyError if the model has none of that name."""
+        sensor = self.model.sensor(name)
+        start, found = int(sensor.adr[0]), int(sensor.dim[0])
+        if found != size:
+            raise ValueError(
+                f"sensor {name!r} of {self.robot.xml_path} has {found} value{'s' * (found != 1)}, {size} are observed"
+            )
+        return slice(start, start + size)
 
     def _step_rows(self, rows: Iterator[int]) -> None:
         model, substeps, controls, finite = self.model, self.robot.substeps, self._controls, self.finite

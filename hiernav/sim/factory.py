@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hiernav.config import ConfigError, TrainConfig
+from hiernav.nav.bundle import ReplanSpec
 from hiernav.nav.goal import GOAL_RADIUS
 from hiernav.nav.observation import ObservationLayout
 from hiernav.nav.option import Planner, WaypointOption, refresh_steps
@@ -113,7 +114,11 @@ def skill_layout(config: TrainConfig) -> ObservationLayout:
     return get_robot(config.robot).observation_layout(guidance, config.skill.clock)
 
 
+def replan_spec(config: TrainConfig) -> ReplanSpec:
+    """The thresholds of a configuration's termination rule, as a bundle has them."""
+    return ReplanSpec(**{name: getattr(config.option, name) for name in ReplanSpec.__struct_fields__})
+
+
 def replan_rule(config: TrainConfig) -> ReplanRule:
     """The termination rule of a configuration."""
-    option = config.option
-    return ReplanRule(option.d_update_m, option.half_fraction, option.invalid, option.period)
+    return replan_spec(config).rule()

@@ -24,19 +24,36 @@ GREMLIN_DISC_RADIUS = GREMLIN_HALF_SIZE * math.sqrt(2.0)  # a gremlin's box in a
 LIDAR_SPACING = 0.1  # [m] between the points that stand for a wall
 MAX_HALF_SIZE = 400.0  # [m], the largest field whose map OccupancyMap accepts, rounded
 MAX_OBSTACLES = 2000
-STEPS_PER_METRE = {"pillar": 150.0, "gremlin": 150.0, "two-room": 300.0, "four-room": 300.0, "map": 300.0}
-MIN_HALF_SIZE = {"pillar": (0.5, 0.5), "gremlin": (0.5, 0.5), "two-room": (0.8, 0.9), "four-room": (1.4, 1.4)}
+MAP_STEPS_PER_METRE = 300.0
 
-_DEFAULTS: dict[str, tuple[float, float, int] | None] = {
-    "pillar": None,
-    "gremlin": (2.0, 2.0, 10),
-    "two-room": (2.0, 2.0, 0),
-    "four-room": (2.0, 2.0, 0),
+
+@dataclass(frozen=True)
+class Kind:
+    """What a kind of generated worlds has in common; `hiernav.sim.worlds` draws them.
+
+    steps_per_metre: control steps of an episode per metre of the longer half extent.
+    least: smallest half extents W, H [m].
+    arguments: of its text, "W,H,N" where it has as many obstacles as one says.
+    default: W, H, N where its text has no arguments; None if it must have some.
+    """
+
+    steps_per_metre: float
+    least: tuple[float, float]
+    arguments: str
+    default: tuple[float, float, int] | None = None
+
+
+KINDS = {
+    "pillar": Kind(150.0, (0.5, 0.5), "W,H,N"),
+    "gremlin": Kind(150.0, (0.5, 0.5), "W,H,N", (2.0, 2.0, 10)),
+    "two-room": Kind(300.0, (0.8, 0.9), "W,H", (2.0, 2.0, 0)),
+    "four-room": Kind(300.0, (1.4, 1.4), "W,H", (2.0, 2.0, 0)),
 }
-_ACCEPTED = (
-    "accepted are pillar(W,H,N), gremlin, gremlin(W,H,N), two-room, two-room(W,H), four-room, four-room(W,H), "
-    "map(FILE.yaml) and FILE.yaml"
-)
+_TEXTS = [
+    *(text for name, kind in KINDS.items() for text in (kind.default and name, f"{name}({kind.arguments})") if text),
+    "map(FILE.yaml)",
+]
+_ACCEPTED = f"accepted are {', '.join(_TEXTS)} and FILE.yaml"
 
 
 @dataclass(frozen=True)
@@ -60,12 +77,11 @@ class WorldSpec:
     def __str__(self) -> str:
         if self.kind == "map":
             return f"map({self.map_path})"
-        sizes = (self.half_width, self.half_height, self.num_obstacles)
-        if sizes == _DEFAULTS[self.kind]:
+        kind, sizes = KINDS[self.kind], (self.half_width, self.half_height, self.num_obstacles)
+        if sizes == kind.default:
             return self.kind
-        numbers = [repr(float(v)).removesuffix(".0") for v in sizes[:2]]
-        if self.kind in ("pillar", "gremlin"):
-            numbers.append(str(self.num_obstacles))
+        given = sizes[: len(kind.arguments.split(","))]
+        numbers = (repr(float(size)).removesuffix(".0") for size in given)
         return f"{self.kind}({','.join(numbers)})"
 
 
@@ -168,23 +184,23 @@ def parse_world(text: str) -> WorldSpec:
         return _map_spec(match[2].strip())
     if text.endswith((".yaml", ".yml")):
         return _map_spec(text)
-    if match is None or match[1] not in _DEFAULTS:
+    if match is None or match[1] not in KINDS:
         raise ValueError(f"world {text!r}: unknown; {_ACCEPTED}")
-    kind = match[1]
-    sizes = _DEFAULTS[kind]
+    kind = KINDS[match[1]]
+    sizes = kind.default
     if match[2] is not None:
-        sizes = _parse_sizes(text, kind, match[2])
+        sizes = _parse_sizes(text, match[1], match[2])
     if sizes is None:
         raise ValueError(f"world {text!r}: the sizes are missing; {_ACCEPTED}")
     width, height, count = sizes
-    for name, value, least in zip(("W", "H"), (width, height), MIN_HALF_SIZE[kind], strict=True):
+    for name, value, least in zip(("W", "H"), (width, height), kind.least, strict=True):
         if not least <= value <= MAX_HALF_SIZE:
             raise ValueError(
                 f"world {text!r}: half extent {name} = {value:g} m, it must be between {least} and {MAX_HALF_SIZE} m"
             )
     if not 0 <= count <= MAX_OBSTACLES:
         raise ValueError(f"world {text!r}: N = {count} obstacles, it must be between 0 and {MAX_OBSTACLES}")
-    return WorldSpec(kind, width, height, count, _max_steps(kind, width, height))
+    return WorldSpec(match[1], width, height, count, _max_steps(kind.steps_per_metre, width, height))
 
 
 def wall_boxes(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -195,10 +211,9 @@ def wall_boxes(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 
 
 def _parse_sizes(text: str, kind: str, arguments: str) -> tuple[float, float, int]:
-    fields = arguments.split(",")
-    wanted = 3 if kind in ("pillar", "gremlin") else 2
+    fields, names = arguments.split(","), KINDS[kind].arguments
+    wanted = len(names.split(","))
     if len(fields) != wanted:
-        names = "W,H,N" if wanted == 3 else "W,H"
         raise ValueError(f"world {text!r}: {len(fields)} arguments, {kind}({names}) takes {wanted}; {_ACCEPTED}")
     try:
         width, height = float(fields[0]), float(fields[1])
@@ -211,11 +226,11 @@ def _parse_sizes(text: str, kind: str, arguments: str) -> tuple[float, float, in
 def _map_spec(path: str) -> WorldSpec:
     xmin, xmax, ymin, ymax = cached_map(path).extent
     width, height = 0.5 * (xmax - xmin), 0.5 * (ymax - ymin)
-    return WorldSpec("map", width, height, 0, _max_steps("map", width, height), path)
+    return WorldSpec("map", width, height, 0, _max_steps(MAP_STEPS_PER_METRE, width, height), path)
 
 
-def _max_steps(kind: str, width: float, height: float) -> int:
-    return max(1, round(STEPS_PER_METRE[kind] * max(width, height)))
+def _max_steps(per_metre: float, width: float, height: float) -> int:
+    return max(1, round(per_metre * max(width, height)))
 
 
 def cached_map(path: str) -> OccupancyMap:

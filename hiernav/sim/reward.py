@@ -10,7 +10,9 @@ import numpy as np
 from hiernav.config import RewardConfig
 from hiernav.nav import path
 
-TERMS = ("path_distance", "progress", "collision", "goal", "leave_field", "tilt", "fall", "time", "goal_distance")
+_MEASURES = ("preset", "lookahead_m", "division_m")
+TERMS = tuple(name for name in RewardConfig.__struct_fields__ if name not in _MEASURES)
+"""Names of the terms, which are the weights of `RewardConfig` in its order: a weight without a term is an error."""
 
 _LEVEL = 0.8
 """Uprightness below which a body counts as tilted: 37 degrees, more than a sound gait sways."""

@@ -48,6 +48,8 @@ class RobotSpec:
     """Ball joint whose rotation and angular velocity are observed."""
     substeps: int = 10
     """Physics steps per control step."""
+    observed_sensors: tuple[ObservationTerm, ...] = ()
+    """Sensors of the model, by name, that are observed besides those of every robot, such as a range finder."""
 
     @property
     def xml_path(self) -> Path:
@@ -75,7 +77,7 @@ class RobotSpec:
                 ObservationTerm("joint_cos", count, "", 1.0),
                 ObservationTerm("joint_velocity", count, "rad/s", 0.1),
             )
-        return terms
+        return terms + self.observed_sensors
 
     def observation_layout(self, guidance: str = "waypoints", clock: bool = False) -> ObservationLayout:
         """What the skill of this robot observes; see `hiernav.nav.observation.observation_layout`."""
@@ -131,7 +133,7 @@ class JointReader:
             self._ball_qvel = slice(ball.dofadr[0], ball.dofadr[0] + 3)
 
     def read(self, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, np.ndarray]:
-        """(N, nq), (N, nv) -> the terms of `RobotSpec.own_terms`, each (N, size) and a new array.
+        """(N, nq), (N, nv) -> those of `RobotSpec.own_terms` that joints give, each (N, size) and a new array.
 
         Rotations are matrices in row-major order, from the joint's frame to its parent's; rates are in rad/s.
         """

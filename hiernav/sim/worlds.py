@@ -27,6 +27,7 @@ PILLAR_KEEP_OUT = 0.3
 # covers: more than the widest robot (0.2) needs at the start, and the goal's 0.3 m can be entered at any time. Two
 # gremlins never meet, and none leaves the field.
 GREMLIN_KEEP_OUT = GREMLIN_ORBIT + GREMLIN_DISC_RADIUS
+KEEP_OUT = {"pillar": PILLAR_KEEP_OUT, "gremlin": GREMLIN_KEEP_OUT}
 TWO_ROOM_OPENING = 1.0
 FOUR_ROOM_OPENING = 0.8
 MIN_WALL_PIECE = 0.3
@@ -80,8 +81,7 @@ def _draw(spec: WorldSpec, seed: int, robot_radius: float, rng: np.random.Genera
         walls = _draw_walls(spec, rng)
         start, goal = _draw_room_points(spec, rng)
     else:
-        keep_out = PILLAR_KEEP_OUT if spec.kind == "pillar" else GREMLIN_KEEP_OUT
-        start, goal, obstacles = _draw_things(spec, keep_out, rng)
+        start, goal, obstacles = _draw_things(spec, KEEP_OUT[spec.kind], rng)
         pillars, gremlins = (obstacles, nothing) if spec.kind == "pillar" else (nothing, obstacles)
     heading = math.pi * (2.0 * rng.random() - 1.0)
     pose = np.array([start[0], start[1], heading])

@@ -10,10 +10,10 @@ import pytest
 from hiernav.nav.frames import world_to_body
 from hiernav.nav.lidar import lidar_closeness
 from hiernav.nav.mirror import mirror_of
-from hiernav.nav.observation import CLOCK_HZ, clock_phase
+from hiernav.nav.observation import CLOCK_HZ, ObservationTerm, clock_phase, observation_layout
 from hiernav.sim.batch import BatchSim
 from hiernav.sim.layout import parse_world
-from hiernav.sim.robots import get_robot
+from hiernav.sim.robots import ROBOTS, get_robot
 from hiernav.sim.scene import scene_for
 from hiernav.sim.worlds import sample_layout
 
@@ -27,12 +27,12 @@ def twin(layout, flip):
 
 
 @pytest.mark.parametrize("guidance", ["waypoints", "world_waypoints", "goal"])
-@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidance: str) -> None:
     spec, layout = get_robot(robot), get_robot(robot).observation_layout(guidance, clock=True)
     mirror = mirror_of(robot, layout)
-    # a mirror in the world's x-z plane, or for the car in its y-z plane, turns yaw into -yaw
-    flip = np.array([-1.0, 1.0]) if robot == "car" else np.array([1.0, -1.0])
+    # a mirror in the world's x-z plane, or for a car in its y-z plane, turns yaw into -yaw
+    flip = mirror.observation_sign[layout.slices["velocimeter"]][:2]
     world = sample_layout(parse_world("pillar(2,2,10)"), 3, spec.radius)
     worlds = [world, twin(world, flip)]
     sim = BatchSim(spec, 2, scene_for([world.spec]))
@@ -63,7 +63,7 @@ def test_the_mirrored_robot_sees_and_does_the_mirrored_thing(robot: str, guidanc
     assert np.abs(seen).max() > 0.1
 
 
-@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_mirroring_twice_changes_nothing(robot: str) -> None:
     layout = get_robot(robot).observation_layout()
     mirror = mirror_of(robot, layout)
@@ -76,3 +76,10 @@ def test_mirroring_twice_changes_nothing(robot: str) -> None:
 def test_an_unknown_robot_has_no_mirror() -> None:
     with pytest.raises(ValueError, match="hovercraft"):
         mirror_of("hovercraft", get_robot("point").observation_layout())
+
+
+def test_a_mirror_of_another_size_than_its_term_is_refused() -> None:
+    """A leg more or less would otherwise move every value behind it."""
+    short = observation_layout([ObservationTerm("joint_sin", 8, "", 1.0)])
+    with pytest.raises(ValueError, match="'joint_sin' has 8 values, its mirror 12"):
+        mirror_of("doggo", short)

@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from hiernav.config import NEUTRAL, TrainConfig, deciding_settings
 from hiernav.finetune import DEFAULTS
 from hiernav.git import git_state
 from hiernav.planner import passes
@@ -413,6 +414,19 @@ def test_a_setting_that_came_later_makes_no_other_training_of_one_that_has_it_as
     configs = {each.variant: each.config for each in catalogue(ROOT, robots=["car"]) if each.kind == "train"}
     assert '"waypoint_frame":"world"' in configs["world-frame"]
     assert not any("waypoint_frame" in config for name, config in configs.items() if name != "world-frame")
+
+
+@pytest.mark.parametrize("key", ["option.spacing_m", "reward.goal_distance", "planner.mirror", "threads"])
+def test_such_a_setting_may_be_of_any_section(monkeypatch, key):
+    """Of one that is as it was nothing is told, so that results from before it came stay those of its training."""
+    config = TrainConfig()
+    before = deciding_settings(config)
+    section, _, name = key.rpartition(".")
+    values = dict(before[section] if section else before)
+    monkeypatch.setitem(NEUTRAL, key, "something else")
+    assert deciding_settings(config) == before
+    monkeypatch.setitem(NEUTRAL, key, values.pop(name))
+    assert deciding_settings(config) == (before | {section: values} if section else values)
 
 
 def test_what_needs_no_training_can_be_had_alone():

@@ -17,7 +17,7 @@ from hiernav.runtime.account import Account, Episode
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.driver import Driver
 from hiernav.runtime.driver_config import DriverConfig
-from hiernav.runtime.estimate import Estimate, EstimatorConfig
+from hiernav.runtime.estimate import Estimate, EstimatorConfig, StateEstimator
 from hiernav.runtime.estimator import Estimator
 from hiernav.runtime.guard import Guard, GuardConfig
 from hiernav.runtime.observe import Event, Observer, TickRecord
@@ -275,6 +275,33 @@ def test_goals_that_come_one_after_the_other_do_not_keep_a_robot_from_driving_th
 
     modes = operated({}, {}, 4.0, t5=Driver.estop, t10=Driver.acknowledge, **{f"t{k}": goal for k in range(11, 30)})
     assert "running" in modes[11:25]
+
+
+def test_an_estimator_of_ones_own_needs_what_its_protocol_says_and_no_more():
+    """Through an emergency stop and its acknowledgement as well: no attribute is missed for the first time there."""
+    asked = {name for name in (*StateEstimator.__annotations__, *vars(StateEstimator)) if not name.startswith("_")}
+    inner, used = Estimator(EstimatorConfig(tilts=False, confirm=False)), set()
+
+    class Own:
+        def __getattr__(self, name: str) -> object:
+            used.add(name)
+            return getattr(inner, name)
+
+        def __setattr__(self, name: str, value: object) -> None:
+            used.add(name)
+            setattr(inner, name, value)
+
+    modes = operated(
+        {"estimator": Own()},
+        {},
+        4.0,
+        t2=lambda driver: driver.set_goal(GOAL),
+        t8=Driver.estop,
+        t15=Driver.acknowledge,
+        t20=lambda driver: driver.set_goal(GOAL),
+    )
+    assert "running" in modes[2:8] and "running" in modes[20:]
+    assert used == asked
 
 
 def test_a_loop_that_begins_again_does_not_drive_a_robot_that_was_not_seen_to_stand():

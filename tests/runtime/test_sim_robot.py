@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hiernav.nav.observation import ObservationTerm
 from hiernav.runtime.clock import FakeClock
 from hiernav.runtime.noise import EXACT, SensorNoise
 from hiernav.runtime.robot import VECTOR_SENSORS, CommandWatchdog
 from hiernav.runtime.sim_robot import SimRobot
 from hiernav.sim.layout import parse_world
-from hiernav.sim.robots import ROBOTS, get_robot
+from hiernav.sim.robots import ROBOTS, RobotSpec, get_robot
 from hiernav.sim.worlds import sample_layout
 
 LAYOUT = sample_layout(parse_world("pillar(2,2,4)"), seed=1)
@@ -29,6 +30,27 @@ def test_a_frame_has_every_sensor_of_the_robot(name):
     assert all(terms[term.name].shape == (term.size,) for term in robot.spec.own_terms)
     assert terms["lidar"].shape == (10,) and terms["lidar"].max() > 0.0
     assert frame.position_fix.shape == (2,)
+
+
+def test_a_sensor_of_the_model_is_observed_where_the_robot_says_so(tmp_path):
+    model = tmp_path / "point.xml"
+    text = get_robot("point").xml_path.read_text()
+    text = text.replace("</body>", '<site name="down" pos="0.16 0 0" zaxis="0 0 -1"/></body>')
+    model.write_text(text.replace("</sensor>", '<rangefinder name="ground" site="down" cutoff="1"/></sensor>'))
+
+    class WithRange(RobotSpec):
+        xml_path = model
+
+    def robot(size: int) -> SimRobot:
+        ground = ObservationTerm("ground", size, "m", 5.0)
+        spec = WithRange("point", 2, 0.002, 0.1, 0.1, free_base=False, observed_sensors=(ground,))
+        return SimRobot(spec, LAYOUT, EXACT)
+
+    frame, layout = robot(1).read(), robot(1).spec.observation_layout()
+    assert layout.sensors["ground"] == 1 and layout.size == get_robot("point").observation_layout().size + 1
+    np.testing.assert_allclose(frame.extra["ground"], [0.1], atol=1e-6)  # of the body's origin above the floor
+    with pytest.raises(ValueError, match="sensor 'ground' of .*point.xml has 1 value, 3 are observed"):
+        robot(3)
 
 
 def test_each_command_lets_one_control_period_pass():

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from small_tasks import WORLD
 
-from hiernav.config import ConfigError, TrainConfig, load_config
-from hiernav.sim.factory import RandomLayouts, expert_planner, make_task, replan_rule
+from hiernav.config import ConfigError, OptionConfig, TrainConfig, load_config
+from hiernav.nav.bundle import PlanSpec, ReplanSpec
+from hiernav.nav.termination import ReplanRule
+from hiernav.sim.factory import RandomLayouts, expert_planner, make_task, replan_rule, replan_spec
 from hiernav.sim.layout import parse_world
 from hiernav.sim.task import NavigationTask
 
@@ -121,6 +125,25 @@ def test_the_task_is_built_as_configured() -> None:
     assert expert_planner(load_config(None, ["planner.planning_radius_m=0.15"])).radius == 0.15
     with pytest.raises(ConfigError, match=r"planning_radius_m = 0.04, expected at least 0.1, the radius of the point"):
         expert_planner(load_config(None, ["planner.planning_radius_m=0.04"]))
+
+
+THRESHOLDS = {"d_update_m": 0.41, "half_fraction": 0.7, "invalid": False, "period": 16}
+"""Other values than the defaults for all of `ReplanSpec`."""
+
+
+def test_a_bundle_takes_along_all_that_an_option_is_configured_with() -> None:
+    of_plans = ("waypoints", "spacing_m")
+    assert ReplanSpec.__struct_fields__ + of_plans == OptionConfig.__struct_fields__
+    assert set(of_plans) <= set(PlanSpec.__struct_fields__) and tuple(THRESHOLDS) == ReplanSpec.__struct_fields__
+
+
+@pytest.mark.parametrize("name", ReplanSpec.__struct_fields__)
+def test_every_threshold_acts_on_the_rule(name: str) -> None:
+    """Training, evaluation and robot make their rules of nothing else."""
+    config = TrainConfig(option=OptionConfig(**{name: THRESHOLDS[name]}))
+    assert getattr(replan_spec(config), name) == THRESHOLDS[name]
+    assert replan_rule(config) == replan_spec(config).rule() != ReplanRule()
+    assert sum(a != b for a, b in zip(astuple(replan_rule(config)), astuple(ReplanRule()), strict=True)) == 1
 
 
 def test_a_random_world_is_reset_into_the_drawn_layout() -> None:
