@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Sequence
 
 from hiernav.config import ConfigError, TrainConfig
@@ -13,6 +15,8 @@ from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
 from hiernav.sim.scene import scene_for
 from hiernav.sim.worlds import sample_layout
+
+log = logging.getLogger(__name__)
 
 
 def check_training(config: TrainConfig, stage: str = "all", overrides: Sequence[str] = ()) -> TrainConfig:
@@ -32,6 +36,7 @@ def check_training(config: TrainConfig, stage: str = "all", overrides: Sequence[
     """
     check_stage(config, stage)
     check_worlds(config)
+    check_threads(config)
     _check_scene(config)
     if stage != "planner":
         _check_mirror(config)
@@ -65,6 +70,19 @@ def check_worlds(config: TrainConfig) -> None:
                     sample_layout(spec, 0, radius)
             except ValueError as error:
                 raise ConfigError(f"{key} = {text!r}: {error}") from None
+
+
+def check_threads(config: TrainConfig) -> None:
+    """Warn of more threads than there are processors to run them."""
+    # there is no such call on macOS
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if config.threads > there:
+        processors = "1 processor" if there == 1 else f"{there} processors"
+        log.warning(
+            "threads = %d, but this process may use %s: more threads than that gain no speed and cost memory",
+            config.threads,
+            processors,
+        )
 
 
 def _check_scene(config: TrainConfig) -> None:

@@ -152,6 +152,17 @@ def test_what_a_check_of_a_data_set_does_not_look_at_is_refused(refused, more):
     assert "--check reads what is there: leave out --config, --samples, --world and KEY=VALUE" in line
 
 
+@pytest.mark.parametrize(("threads", "told"), [(3, 1), (2, 0)])
+def test_more_threads_than_processors_are_told_of(tmp_path, monkeypatch, caplog, threads, told):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5}, raising=False)
+    small = ("--samples", "1", "planner.samples_per_world=1", f"threads={threads}")
+    assert cli.main(["dataset", "--out", str(tmp_path / "data"), "--world", "pillar(1.2,1.2,2)", *small]) == 0
+    monkeypatch.setattr(check, "_check_machine", lambda _: None)  # which needs torch
+    check.check_training(load_config(None, [f"threads={threads}"]))
+    warning = "threads = 3, but this process may use 2 processors: more threads than that gain no speed and cost memory"
+    assert caplog.messages == [warning, warning][: 2 * told]
+
+
 @pytest.mark.parametrize("command", ["world", "train", pytest.param("evaluate", marks=pytest.mark.train)])
 def test_a_map_without_a_way_from_start_to_goal_is_refused(refused, tmp_path, request, command):
     write_map(tmp_path, np.ones((40, 40), dtype=bool))

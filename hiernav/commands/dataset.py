@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from hiernav.check import check_worlds
+    from hiernav.check import check_threads, check_worlds
     from hiernav.config import load_config
     from hiernav.planner.dataset import data_seed, label_settings
     from hiernav.planner.store import read_dataset, read_manifest, write_dataset
@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             config = load_config(arguments.config, overrides)
             check_worlds(config)
+            check_threads(config)
         total = manifest.samples if arguments.check else config.planner.samples
         task = progress.add_task("checking" if arguments.check else "samples", total=total, note="")
         first: list[int] = []

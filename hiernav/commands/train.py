@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from hiernav.check import check_collector, check_training
+    from hiernav.check import check_collector, check_threads, check_training
     from hiernav.config import load_config
     from hiernav.run import Run, RunError
 
@@ -70,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
                 "also as --worlds, --collector, --workers or --ray-address"
             )
         run = Run.open(arguments.resume)
+        check_threads(run.config)
     else:
         config = load_config(arguments.config, overrides)
         check_collector(config, overrides)

@@ -237,6 +237,7 @@ class Episodes:
         summary = summarise(self.account, self.driver.timer, self.driver.loop, self.granted)
         summary["settings"] = differing(self.settings)
         summary["recording"] = None if self.recorder is None else self.recorder.summary()
+        summary["dropped_observers"] = dict(self.driver.audience.dropped)
         summary["startup_seconds"] = drives[0].armed_age if drives else None
         if self.remote is not None:
             summary["adapter"] = {"watchdog_trips": self.remote.watchdog_trips, "realtime": dict(self.remote.realtime)}

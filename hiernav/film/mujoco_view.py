@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import traceback
+
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +34,7 @@ class MujocoView:
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # every back end fails in its own way
+            _discard_what_failed(error)
             raise no_gl(error) from error
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = 90.0, -35.0
@@ -50,6 +54,15 @@ class MujocoView:
 
     def close(self) -> None:
         self._renderer.close()
+
+
+def _discard_what_failed(error: Exception) -> None:
+    """Collect what could not be made: the destructors of some releases of MuJoCo print a traceback then."""
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        traceback.clear_frames(error.__traceback__)
+    finally:
+        sys.unraisablehook = before
 
 
 def _paint(model: mujoco.MjModel) -> None:

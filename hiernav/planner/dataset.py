@@ -7,11 +7,13 @@ itself is among the visits of both, as a robot has entered the pixel it stands i
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,6 +39,9 @@ _MAX_TRIES = 200
 """Starts tried for each sample of a world, on average."""
 _OFF_PATH = 0.1
 """Standard deviation of starts around the path [m]."""
+
+_wanted: Connection | None = None
+"""In a process that makes samples for another one: readable once they are not wanted any more."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,8 @@ def make_samples(
 def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], processes: int) -> Iterator[T]:
     """Results of `function(*task)` in the order of the tasks, computed here or in several processes.
 
+    Once nobody wants more of them, as after Ctrl-C, the samples that are under way are given up.
+
     Raises:
         WorkersLost: one of these died.
     """
@@ -160,14 +167,24 @@ def map_tasks(function: Callable[..., T], tasks: Sequence[tuple[Any, ...]], proc
         for task in tasks:
             yield function(*task)
         return
+    context = get_context("forkserver")
+    wanted, want = context.Pipe(duplex=False)
     try:
-        with ProcessPoolExecutor(processes, get_context("forkserver"), end_with_parent) as pool:
+        with wanted, ProcessPoolExecutor(processes, context, _begin_work, (wanted,)) as pool, want:
             yield from pool.map(function, *zip(*tasks, strict=True))
     except BrokenProcessPool as error:
         raise WorkersLost(
             f"one of {processes} processes that make samples died, as it happens where memory runs out: "
             "begin again with fewer threads"
         ) from error
+
+
+def _begin_work(wanted: Connection) -> None:
+    """In a worker: make samples until the other end of `wanted` is closed; Ctrl-C is for the parent alone."""
+    global _wanted
+    _wanted = wanted
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:
@@ -181,6 +198,8 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
     visits: list[VisitMap] = []
     tries = 0
     while len(starts) < count:
+        if _wanted is not None and _wanted.poll():
+            raise InterruptedError("nobody wants these samples any more")
         tries += 1
         if tries > _MAX_TRIES * count:
             raise WorldError(

@@ -156,6 +156,8 @@ class ControlServer:
             raise
         self._closed = False
         self._told = ""
+        self._reserve: int | None = None
+        self._take_reserve()
         self._thread = threading.Thread(target=self._listen, name="control", daemon=True)
 
     def __enter__(self) -> ControlServer:
@@ -176,6 +178,7 @@ class ControlServer:
         if self._thread.ident is not None:
             self._thread.join(2.0)
         self._server.close()
+        self._give_up_reserve()
         self.path.unlink(missing_ok=True)
         self._lock.release()
 
@@ -219,7 +222,7 @@ class ControlServer:
             client.socket.close()
 
     def _complain(self, why: str) -> None:
-        """Tell why no command can be given, once as long as that is why."""
+        """Tell what keeps commands away, once as long as that does."""
         if why != self._told:
             log.error("control socket %s: %s", self.path, why)
         self._told = why
@@ -240,20 +243,49 @@ class ControlServer:
                 obeyed.pop(0).answer({"taken": None, "error": "too many clients wait for their answers"})
             while clients and clients[0].deadline <= time.monotonic():
                 clients.pop(0).answer({"error": f"expected one line within {PATIENCE:g} s"})
+            self._take_reserve()
             if self._server in ready:
                 try:
-                    clients.append(_Client(self._server.accept()[0]))
-                except OSError as error:  # the client is gone again, there is no room for one, or this is the end
-                    if error.errno in NO_ROOM:
-                        self._complain(f"{error.strerror}: nobody can give a command")
+                    clients.append(_Client(self._accept()))
+                except OSError:  # the client is gone again, there is no room for one, or this is the end
                     time.sleep(0.01)
                     continue
-                self._told = ""
                 if len(clients) > CLIENTS:
                     clients.pop(0).answer({"error": "too many clients"})
         for client in obeyed:
             if not client.answered():
                 client.answer({"taken": False, "error": "the loop has ended"})
+
+    def _accept(self) -> socket.socket:
+        """The next client, in the place of the reserve where this process may have no more files.
+
+        Raises:
+            OSError: there is none, or no room for it.
+        """
+        try:
+            accepted = self._server.accept()[0]
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+            self._complain(f"{error.strerror}: at most one client at a time can give a command")
+            if self._reserve is None:
+                raise
+            self._give_up_reserve()
+            return self._server.accept()[0]
+        if self._reserve is not None:
+            self._told = ""
+        return accepted
+
+    def _take_reserve(self) -> None:
+        """Hold a descriptor that the next client can have where there is no other: it may be the one who says stop."""
+        if self._reserve is None:
+            with suppress(OSError):
+                self._reserve = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+    def _give_up_reserve(self) -> None:
+        if self._reserve is not None:
+            os.close(self._reserve)
+            self._reserve = None
 
 
 class _Client:

@@ -107,6 +107,8 @@ class Audience:
 
     def __init__(self, observers: Sequence[Observer] = ()) -> None:
         self.observers = list(observers)
+        self.dropped: dict[str, str] = {}
+        """What the first of each class was dropped for."""
 
     def __bool__(self) -> bool:
         return bool(self.observers)
@@ -116,9 +118,11 @@ class Audience:
         for observer in self.observers[:]:
             try:
                 what(observer)
-            except Exception:
-                log.exception("observer failed and is dropped")
+            except Exception as error:
                 self.observers.remove(observer)
+                name = type(observer).__name__
+                self.dropped.setdefault(name, f"{type(error).__name__}: {error}".removesuffix(": "))
+                log.exception("%s failed and is dropped", name)
 
     def emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         """Tell of an event."""

@@ -58,6 +58,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     for fault in summary["faults"]["newest"][-SHOWN_FAULTS:]:
         after = ", acknowledged" if fault["acknowledged"] else ""
         console.print(f"  after {fault['seconds']:.1f} s: {fault['why']}{after}", highlight=False, markup=False)
+    for name, why in summary.get("dropped_observers", {}).items():
+        console.print(f"dropped: {name}, {why}", highlight=False, markup=False)
     granted = ", ".join(f"{name} {text}" for name, text in summary["realtime"].items()) or "not asked"
     console.print(f"real time: {granted}", highlight=False)
     if summary.get("settings"):

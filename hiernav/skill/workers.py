@@ -8,6 +8,7 @@ batch is collected anew, in worlds that nobody has seen, and those of the others
 from __future__ import annotations
 
 import logging
+import re
 import threading
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -119,9 +120,10 @@ class Worker:
                 deaths += 1
                 if deaths == _ATTEMPTS or order.stopping.is_set():
                     raise WorkersLost(
-                        f"worker {self.index} died {deaths} times without delivering anything, at last of: {error}"
+                        f"worker {self.index} died {deaths} times without delivering anything, at last of: "
+                        f"{self._told(error)}"
                     ) from error
-                reason = str(error).partition("\n")[0] or type(error).__name__
+                reason = self._told(error).partition("\n")[0] or type(error).__name__
                 log.warning("worker %d died and is replaced: %s", self.index, reason)
 
     def stop(self) -> None:
@@ -129,6 +131,10 @@ class Worker:
         if self.collector is not None:
             self.collector.shutdown()
             self.collector = None
+
+    def _told(self, error: Exception) -> str:
+        """What a death is said to be of: torchrl counts the processes of each collector anew, and this one has one."""
+        return re.sub(r"(?i)\bworker 0\b", f"worker {self.index}", str(error))
 
     def _collect(self, order: Order) -> TensorDict:
         if self.collector is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -188,6 +189,26 @@ def test_without_opengl_the_error_says_what_is_missing(bundle_film):
     assert "MuJoCo cannot draw with MUJOCO_GL=off" in done.stderr and "libegl1" in done.stderr
     assert "the view from above needs neither" in done.stderr
     assert not path.parent.exists() or list(path.parent.iterdir()) == []
+
+
+def test_without_opengl_no_destructor_of_mujoco_adds_a_traceback_to_the_error(policies, tmp_path, monkeypatch):
+    class Unmade:
+        """As some releases: collected without what it would have had, were it made."""
+
+        def __init__(self, *_: object) -> None:
+            raise RuntimeError("no context")
+
+        def __del__(self) -> None:
+            self.free()
+
+    unraisable: list[object] = []
+    monkeypatch.setattr("mujoco.Renderer", Unmade)
+    monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
+    hook = sys.unraisablehook
+    with pytest.raises(ValueError, match="MuJoCo cannot draw .*no context"):
+        film(policies, tmp_path / "film.gif", FilmSettings(view="mujoco", size=200))
+    gc.collect()
+    assert unraisable == [] and sys.unraisablehook is hook
 
 
 @pytest.fixture

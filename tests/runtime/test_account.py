@@ -480,6 +480,19 @@ def test_a_picture_that_cannot_be_drawn_changes_no_exit_code(run, tmp_path, caps
     assert capsys.readouterr().err.startswith(f"run_loop: out/drive-0.png is not written: {says}")
 
 
+def test_what_has_watched_a_run_and_failed_is_named_in_its_summary(run, tmp_path, capsys, monkeypatch):
+    def failing(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("hiernav.runtime.recorder.Recorder.tick", failing)
+    assert run(*SHORT, "--no-pictures", "--record", "drive.mcap") == exits.OK
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["dropped_observers"] == {"Recorder": "MemoryError"}
+    assert "\ndropped: Recorder, MemoryError\n" in capsys.readouterr().out
+    assert run(*SHORT, "--no-pictures") == exits.OK
+    assert json.loads((tmp_path / "out/summary.json").read_text())["dropped_observers"] == {}
+
+
 @pytest.mark.parametrize(
     ("error", "code", "says"),
     [

@@ -409,6 +409,34 @@ def test_a_process_without_room_for_clients_is_told_before_it_listens(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_robot_is_stopped_by_a_process_that_may_have_no_more_files(serving, caplog):
+    """Of one that has used up its files while it drives, as with a limit that was lowered meanwhile."""
+    _, path = serving
+    until(path, mode="ready")
+    before, limit = resource.getrlimit(resource.RLIMIT_NOFILE), 0
+    clients = [socket.socket(socket.AF_UNIX) for _ in range(3)]
+    taken = set(map(int, os.listdir("/proc/self/fd")))
+    while limit in taken:
+        limit += 1
+    answers: list[dict[str, object]] = []
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+    try:
+        for client, line in zip(clients, (b"", b"stop\n", b"status\n"), strict=True):
+            client.settimeout(60.0)
+            client.connect(str(path))
+            client.sendall(line)  # the first has nothing to say, and is waited for
+        for client in clients:
+            answers.append(json.loads(client.recv(4096)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        for client in clients:
+            client.close()
+    assert "expected one line" in str(answers[0]["error"])
+    assert [answer["mode"] for answer in answers[1:]] == ["estop", "estop"]
+    assert len(caplog.messages) == 1 and "at most one client at a time" in caplog.messages[0]
+    assert "error" not in tell(path, "status")
+
+
 def test_that_nobody_can_connect_any_more_is_told_once(tmp_path, monkeypatch, caplog):
     path, tries = tmp_path / "loop.sock", []
 
@@ -422,7 +450,7 @@ def test_that_nobody_can_connect_any_more_is_told_once(tmp_path, monkeypatch, ca
     monkeypatch.setattr(control.socket, "socket", Full)
     with ControlServer(driver_of(), path):
         assert "error" not in tell(path, "status")
-    assert [each for each in caplog.messages if "Too many open files: nobody can" in each] == caplog.messages
+    assert [each for each in caplog.messages if "Too many open files: at most one client" in each] == caplog.messages
     assert len(caplog.messages) == 1
 
 

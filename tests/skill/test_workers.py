@@ -125,6 +125,14 @@ def test_a_worker_that_dies_is_replaced_by_one_in_worlds_of_its_own(config, capl
     assert machines.stopped == 1
 
 
+def test_a_worker_that_dies_is_named_by_one_number(config, caplog) -> None:
+    worker = Worker(1, config, Scripted(0, 1, error=RuntimeError("a process failed: worker 0 (exit code -9).")))
+    worker.collect(order())
+    assert caplog.messages == ["worker 1 died and is replaced: a process failed: worker 1 (exit code -9)."]
+    with pytest.raises(WorkersLost, match="worker 1 died 3 times .*: worker 1 failed to start$"):
+        Worker(1, config, Scripted(0, 0, 0, error=RuntimeError("Worker 0 failed to start"))).collect(order())
+
+
 def test_a_segment_begins_anew_for_a_worker_that_lives_on(config) -> None:
     worker = Worker(0, config, Scripted())
     collected = [worker.collect(order(segment)) for segment in (0, 0, 256)]
