@@ -308,3 +308,11 @@ def test_the_newest_run_is_the_one_begun_last(tmp_path: Path) -> None:
 def test_where_there_is_no_run_yet_the_error_says_how_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="no run folder in .*/: name another one, or make one with `hiernav train`"):
         newest_run(tmp_path)
+
+
+def test_a_run_notes_each_code_that_trains_in_it_once(run, monkeypatch):
+    assert run.codes() == []
+    monkeypatch.setattr(run_module, "package_state", lambda: ("abc", True))
+    for code in (None, "def", None, "def"):
+        run.note_code(code)
+    assert Run.open(run.path).codes() == ["abc with changes", "def"]
