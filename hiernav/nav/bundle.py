@@ -24,6 +24,7 @@ from hiernav.nav.onnx_file import OnnxFacts, OnnxFileError, inspect_onnx
 from hiernav.nav.termination import ReplanRule
 
 FORMAT_VERSION = 1
+"""Of the manifest. An older runtime refuses a field that it does not know; raise it where one changes its meaning."""
 PLANNER, SKILL, GOLDEN, MANIFEST = "planner.onnx", "skill.onnx", "golden.npz", "manifest.json"
 HASHED_FILES = (PLANNER, SKILL, GOLDEN)
 MAX_FILE_BYTES = 50_000_000
