@@ -89,7 +89,7 @@ def test_a_simulated_robot_passes_the_dry_run(script, capsys, monkeypatch):
     monkeypatch.setattr(dry_run, "WAKES", 1)
     assert script.main(["--dry-run", "--bundle", str(SCRIPT.parent / "bundles" / "point")]) == 0
     out = capsys.readouterr().out
-    assert "error" not in out and "guard.slow_ttc" in out  # a setting of point.yaml
+    assert "│ error" not in out and "guard.slow_ttc" in out  # a setting of point.yaml
 
 
 def test_a_robot_that_does_not_end_fails_the_dry_run(monkeypatch, tmp_path, capsys):

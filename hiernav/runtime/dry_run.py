@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from hiernav.nav.bundle import Bundle
 from hiernav.runtime.clock import MonotonicClock
@@ -29,6 +30,8 @@ LOOK, PATIENCE = 2.5, 15.0
 spoken, at most so long."""
 ESTIMATOR_NEEDS = ("position_fix", "magnetometer")
 WAKES = 200
+SHOWN = 2000
+"""Letters of a value."""
 PERIOD = 0.005
 
 
@@ -57,8 +60,14 @@ def print_report(found: Mapping[str, Any], console: Console) -> None:
         table = Table(title=part, title_justify="left", show_header=False)
         for key, value in entries.items():
             style = "red" if key == "error" or str(value).startswith(("refused", "missing")) else None
-            table.add_row(key, str(value), style=style)
+            table.add_row(_shown(key), _shown(value), style=style)
         console.print(table)
+
+
+def _shown(value: object) -> Text:
+    """As it is: texts of a bundle or an adapter are no markup, move no cursor, and may be long."""
+    letters = (letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in str(value)[:SHOWN])
+    return Text("".join(letters))
 
 
 def _attempt(check: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -77,6 +86,7 @@ def _check_bundle(bundle: Bundle) -> dict[str, Any]:
         "control period": f"{1e3 * manifest.control_period_s:g} ms",
         "observation": f"{bundle.layout.size} values: {', '.join(bundle.layout.names)}",
         "golden values": f"off by {worst:.1g} at most",
+        "trained": ", ".join(f"{name} {value}" for name, value in manifest.provenance.items()) or "not told",
     }
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from puck import Puck
 from recorded_drive import BUNDLE
+from rich.console import Console
 
 from hiernav.nav.bundle import load_bundle
 from hiernav.runtime import dry_run
@@ -31,11 +33,15 @@ class Still(Puck):
 
 
 def found_of(monkeypatch, sees, settings: Settings | None = None) -> dict[str, object]:
+    return report_of(monkeypatch, sees, settings)["robot"]
+
+
+def report_of(monkeypatch, sees, settings: Settings | None = None) -> dict[str, dict[str, object]]:
     monkeypatch.setattr(dry_run, "WAKES", 1)
     monkeypatch.setattr(dry_run, "LOOK", 0.2)
     monkeypatch.setattr(dry_run, "PATIENCE", 0.5)
     robot = Still(control_period=0.02, sees=sees)
-    return dry_run.report(lambda: load_bundle(BUNDLE), lambda: robot, settings or Settings())["robot"]
+    return dry_run.report(lambda: load_bundle(BUNDLE), lambda: robot, settings or Settings())
 
 
 @pytest.mark.parametrize(
@@ -75,3 +81,17 @@ def test_a_sensor_that_speaks_seldom_is_not_silent(monkeypatch):
 def test_settings_that_the_guard_refuses_are_found_before_anything_moves(monkeypatch):
     settings = replace(Settings(), guard=GuardConfig(slowed=(7,)))
     assert "actuators are 0 to 1" in found_of(monkeypatch, lambda frame: frame, settings)["error"]
+
+
+def test_it_tells_how_the_networks_were_trained(monkeypatch):
+    found = report_of(monkeypatch, lambda frame: frame)["bundle"]
+    assert found["trained"].startswith("hiernav 0.1.0, torch 2.13.0, seed 0, skill_steps 100000")
+
+
+def test_texts_of_a_bundle_are_shown_as_they_are():
+    told = {"trained": "settings [red]run_dir=[/x]\x1b[2J\n", "[b]extra": "y " * dry_run.SHOWN}
+    screen = Console(file=io.StringIO(), width=200)
+    dry_run.print_report({"bundle": told}, screen)
+    shown = screen.file.getvalue()
+    assert "settings [red]run_dir=[/x]\N{REPLACEMENT CHARACTER}[2J" in shown and "[b]extra" in shown
+    assert "\x1b" not in shown and shown.count("y") == dry_run.SHOWN // 2
