@@ -42,7 +42,7 @@ from hiernav.nav.occupancy import RESOLUTION
 from hiernav.planner.dataset import label_settings
 from hiernav.planner.network import HypothesisNetwork, PaperNetwork
 from hiernav.planner.train import load_network, torch_planner
-from hiernav.run import Run, RunError
+from hiernav.run import UNKNOWN_CODE, Run, RunError
 from hiernav.runtime.policy import check_golden
 from hiernav.sim.factory import make_task, replan_spec, skill_layout
 from hiernav.sim.robots import get_robot
@@ -51,6 +51,8 @@ from hiernav.skill.train import TorchSkill, kept, load_actor
 
 OPSET = 18
 GOLDEN_SAMPLES = 32
+_PRIVATE = ("planner.data", "skill.ray_address")
+"""Settings that name places of the machine that trained; nobody else is told of them."""
 
 
 class _MeanAction(nn.Module):
@@ -249,8 +251,10 @@ def _provenance(run: Run, states: dict) -> dict[str, str | int | float]:
     values = {
         "hiernav": __version__,
         "torch": torch.__version__.split("+")[0],
-        "code": ", ".join(run.codes()) or "unknown",
-        "settings": shlex.join(as_overrides(run.config)),
+        "code": ", ".join(run.codes()) or UNKNOWN_CODE,
+        "fine_tuned_with" if states["skill"].get("imported") else "settings": shlex.join(
+            override for override in as_overrides(run.config) if override.partition("=")[0] not in _PRIVATE
+        ),
         "seed": run.config.seed,
         "skill_steps": int(states["skill"]["steps"]),
         "skill_updates": int(states["skill"]["learner"]["updates"]),

@@ -12,7 +12,7 @@ import numpy as np
 from hiernav.config import ConfigError, TrainConfig, dump_config, load_config
 from hiernav.evaluate import open_policies
 from hiernav.nav.bundle import Bundle, load_bundle
-from hiernav.run import Run, RunError
+from hiernav.run import UNKNOWN_CODE, Run, RunError
 
 DEFAULTS = {
     "run_dir": "null",
@@ -63,8 +63,11 @@ def begin_fine_tuning(config: TrainConfig, source: str | Path) -> Run:
 
     source = Path(source)
     planner, skill = _run_states(source) if _is_run(source) else _bundle_states(load_bundle(source))
+    codes = _codes(source)
 
     def begin(run: Run) -> None:
+        for code in codes:
+            run.note_code(code)
         trainer = PlannerTrainer(config, run)
         expected, missing = trainer.network.state_dict(), "no such layer"
         for name in dict.fromkeys((*planner, *expected)):
@@ -80,6 +83,13 @@ def begin_fine_tuning(config: TrainConfig, source: str | Path) -> Run:
         run.save("skill", skill)
 
     return Run.create(config, begin)
+
+
+def _codes(source: Path) -> list[str]:
+    """Which code has trained a run or bundle, as far as it tells."""
+    if _is_run(source):
+        return Run.open(source).codes() or [UNKNOWN_CODE]
+    return str(load_bundle(source).manifest.provenance.get("code", UNKNOWN_CODE)).split(", ")
 
 
 def _is_run(path: Path) -> bool:

@@ -43,6 +43,8 @@ class TrainingDiverged(RuntimeError):
 
 
 COMMITS = "commits.txt"
+UNKNOWN_CODE = "unknown"
+"""Of what has trained without a note of it."""
 
 _LOGS = {"metrics_length": "metrics.jsonl", "rates_length": "rates.jsonl"}
 """Key of a checkpoint -> log whose length it holds."""
@@ -107,21 +109,22 @@ class Run:
         self._append("metrics.jsonl", stage, step, values, stage)
 
     def note_code(self, code: str | None = None) -> None:
-        """Note which code trains in this process, as `hiernav.git.code_name` gives it; None: ask git.
+        """Note which code trains in this process, as `hiernav.git.code_name` gives it; None: what git says now.
 
         Raises:
             RunError: it cannot be written.
         """
-        code = code or code_name(package_state())
-        with self.writing():
-            if code not in self.codes():
-                with (self.path / COMMITS).open("a") as file:
-                    file.write(f"{code}\n")
+        code, known = code or code_name(package_state()), self.codes()
+        if code in known:
+            return
+        begun = not known and any(self.path.glob("*/checkpoint.pt"))
+        with self.writing(), (self.path / COMMITS).open("a") as file:
+            file.write(f"{UNKNOWN_CODE}\n" * begun + f"{code}\n")
 
     def codes(self) -> list[str]:
         """Which code has trained, as far as it was noted; each once, in order."""
         file = self.path / COMMITS
-        return file.read_text().splitlines() if file.exists() else []
+        return list(dict.fromkeys(file.read_text().splitlines())) if file.exists() else []
 
     def start_clock(self, stage: str) -> None:
         """Count the seconds of a stage from here on, after those that other processes have spent on it."""

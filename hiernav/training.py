@@ -9,6 +9,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
+from hiernav.git import code_name, package_state
 from hiernav.nav.option import Planner
 from hiernav.nav.planners import VerifiedPlanner
 from hiernav.planner import train as planner_train
@@ -27,7 +28,7 @@ def train(run: Run, stage: str = "all", progress: Progress | None = None, code: 
         run: to train into; `Run.create` begins one, `Run.open` goes on with one.
         stage: what to train.
         progress: to show how far it is; None: it is silent.
-        code: see `Run.note_code`.
+        code: that this process runs, see `Run.note_code`; None: what git says at the beginning.
 
     Raises:
         KeyboardInterrupt: somebody pressed Ctrl-C, whatever a library that was interrupted made of it.
@@ -35,6 +36,7 @@ def train(run: Run, stage: str = "all", progress: Progress | None = None, code: 
         RunError: the run folder cannot be written to.
         ConfigError: see `hiernav.run.check_stage`.
     """
+    code = code or code_name(package_state())  # now: what comes after is not what this process has loaded
     try:
         _train(run, stage, progress or Progress(disable=True, console=Console(quiet=True)), code)
     except Exception as error:
@@ -47,7 +49,7 @@ def train(run: Run, stage: str = "all", progress: Progress | None = None, code: 
         raise
 
 
-def _train(run: Run, stage: str, progress: Progress, code: str | None) -> None:
+def _train(run: Run, stage: str, progress: Progress, code: str) -> None:
     torch.set_num_threads(run.config.threads)
     if run.config.skill.preset == "baseline":
         check_stage(run.config, stage)
@@ -73,7 +75,7 @@ def _train(run: Run, stage: str, progress: Progress, code: str | None) -> None:
         _train_skill(run, guide, progress, code)
 
 
-def _train_skill(run: Run, guide: Planner | None, progress: Progress, code: str | None) -> None:
+def _train_skill(run: Run, guide: Planner | None, progress: Progress, code: str) -> None:
     skill = skill_train.SkillTrainer(run.config, run, guide)
     steps = skill.resume()
     if steps is not None and not skill.finished:

@@ -88,6 +88,21 @@ def test_what_is_known_of_a_skill_goes_on_from_bundle_to_bundle(able_bundle: Pat
     assert skill["evaluations"][0]["step"] == known["skill_steps"]
 
 
+def test_a_fine_tuned_bundle_tells_that_it_is_one_and_which_code_trained_what_it_came_from(able_run, tmp_path):
+    source = Run.open(shutil.copytree(able_run, tmp_path / "source"))
+    source.note_code("abc")
+    source.close()
+    assert cli.main(command(source.path, tmp_path / "tuned")) == 0
+    assert cli.main(["export", "--run", str(tmp_path / "tuned"), "--onnx", str(tmp_path / "bundle")]) == 0
+    told = load_bundle(tmp_path / "bundle").manifest.provenance
+    assert told["code"].startswith(", ".join(source.codes())) and "abc" in source.codes()
+    assert "settings" not in told and "planner.samples" in str(told["fine_tuned_with"])
+    config = fine_tuning_config(tmp_path / "bundle", [f"run_dir={tmp_path / 'again'}"])
+    assert begin_fine_tuning(config, tmp_path / "bundle").codes() == str(told["code"]).split(", ")
+    manifest = json.loads((tmp_path / "bundle" / "manifest.json").read_text())
+    assert str(tmp_path) not in json.dumps(manifest), "no place of this machine is told"
+
+
 @pytest.mark.parametrize("stage", ["planner", "skill"])
 def test_a_run_that_lacks_a_network_is_told_to_go_on(able_run: Path, tmp_path: Path, stage: str):
     source = Path(shutil.copytree(able_run, tmp_path / "source"))

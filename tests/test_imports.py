@@ -29,7 +29,7 @@ ALLOWED = {
     "run": {"config", "files", "git", "lock"},
     "planner": {"nav", "sim", "config", "run", "device", "files", "lock", "orphans"},
     "skill": {"nav", "sim", "config", "run", "device", "files"},
-    "training": {"nav", "sim", "planner", "skill", "run"},
+    "training": {"git", "nav", "sim", "planner", "skill", "run"},
     "runtime": {"nav", "decode", "__init__"},
     "finetune": {"nav", "planner", "config", "run", "evaluate"},
     "view": {"nav", "runtime"},

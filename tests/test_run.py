@@ -316,3 +316,12 @@ def test_a_run_notes_each_code_that_trains_in_it_once(run, monkeypatch):
     for code in (None, "def", None, "def"):
         run.note_code(code)
     assert Run.open(run.path).codes() == ["abc with changes", "def"]
+
+
+def test_notes_of_older_runs_are_read_and_what_trained_without_one_is_not_forgotten(run):
+    (run.path / "skill").mkdir()
+    (run.path / "skill" / "checkpoint.pt").touch()
+    run.note_code("def")
+    assert run.codes() == ["unknown", "def"]
+    (run.path / "commits.txt").write_text("abc\nabc\nno repository\nabc\n")  # a line for each process
+    assert run.codes() == ["abc", "no repository"]

@@ -59,8 +59,11 @@ class MujocoView:
 def _discard_what_failed(error: Exception) -> None:
     """Collect what could not be made: the destructors of some releases of MuJoCo print a traceback then."""
     before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    cause: BaseException | None = error
     try:
-        traceback.clear_frames(error.__traceback__)
+        while cause is not None:
+            traceback.clear_frames(cause.__traceback__)
+            cause = cause.__cause__ or cause.__context__
     finally:
         sys.unraisablehook = before
 

@@ -187,8 +187,15 @@ def _begin_work(wanted: Connection) -> None:
     end_with_parent()
 
 
+def _require_wanted() -> None:
+    """InterruptedError if whoever asked for samples does not want them any more."""
+    if _wanted is not None and _wanted.poll():
+        raise InterruptedError("nobody wants these samples any more")
+
+
 def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int) -> Samples:
     """`count` samples of one world; WorldError if a path leads to the goal from hardly anywhere."""
+    _require_wanted()
     rng = np.random.default_rng(np.random.SeedSequence((seed, 0x1ABE1)))
     layout = sample_layout(spec, seed, settings.radius)
     occupancy = layout.occupancy(0.0)
@@ -198,8 +205,7 @@ def label_world(settings: LabelSettings, spec: WorldSpec, seed: int, count: int)
     visits: list[VisitMap] = []
     tries = 0
     while len(starts) < count:
-        if _wanted is not None and _wanted.poll():
-            raise InterruptedError("nobody wants these samples any more")
+        _require_wanted()
         tries += 1
         if tries > _MAX_TRIES * count:
             raise WorldError(

@@ -67,7 +67,8 @@ def measure(
     trainer = PlannerTrainer(run.config, run)
     trainer.resume()
     run.start_clock("planner")
-    run.note_code(code)
+    if not trainer.finished:
+        run.note_code(code)
     total = config.planner.epochs * samples
     trainer.train(lambda now: show("training", now.done, total) if now.stage == "training" else None)
     run.close()

@@ -14,7 +14,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,10 @@ LONGEST = 256
 """Bytes of a command."""
 PATIENCE = 1.0
 """Time a client may take for its line, all of it, and at most that of an answer from then on [s]."""
+HASTE = 0.05
+"""The same where others wait and there is no room for them [s]."""
+REMINDER = 60.0
+"""Time until the same complaint is made again [s]."""
 LOOK_AGAIN = 0.005
 """Time between looks at whether a command has taken effect [s]."""
 CLIENTS = 32
@@ -155,7 +159,7 @@ class ControlServer:
             self._lock.release()
             raise
         self._closed = False
-        self._told = ""
+        self._told = "", 0.0
         self._reserve: int | None = None
         self._take_reserve()
         self._thread = threading.Thread(target=self._listen, name="control", daemon=True)
@@ -222,10 +226,11 @@ class ControlServer:
             client.socket.close()
 
     def _complain(self, why: str) -> None:
-        """Tell what keeps commands away, once as long as that does."""
-        if why != self._told:
+        """Tell what keeps commands away, once in a while as long as that does."""
+        told, since = self._told
+        if why != told or time.monotonic() - since > REMINDER:
             log.error("control socket %s: %s", self.path, why)
-        self._told = why
+            self._told = why, time.monotonic()
 
     def _answer_clients(self, clients: list[_Client], obeyed: list[_Client]) -> None:
         """Listen until the end, with who is at a line in `clients`, and who waits for an answer in `obeyed`."""
@@ -233,9 +238,8 @@ class ControlServer:
             wait = max(clients[0].deadline - time.monotonic(), 0.0) if clients else None
             if obeyed:
                 wait = LOOK_AGAIN if wait is None else min(wait, LOOK_AGAIN)
-            heard: list[socket.socket | _Client] = [self._server, *clients]
-            ready = select.select(heard, [], [], wait)[0]
-            for client in [each for each in clients if each in ready and each.hear(self.driver)]:
+            ready = _ready((self._server, *clients), wait)
+            for client in [each for each in clients if each.fileno() in ready and each.hear(self.driver)]:
                 clients.remove(client)
                 obeyed.append(client)
             obeyed[:] = [client for client in obeyed if not client.answered()]
@@ -244,10 +248,12 @@ class ControlServer:
             while clients and clients[0].deadline <= time.monotonic():
                 clients.pop(0).answer({"error": f"expected one line within {PATIENCE:g} s"})
             self._take_reserve()
-            if self._server in ready:
+            if self._server.fileno() in ready:
                 try:
                     clients.append(_Client(self._accept()))
-                except OSError:  # the client is gone again, there is no room for one, or this is the end
+                except OSError as error:  # the client is gone again, there is no room for one, or this is the end
+                    if error.errno in NO_ROOM and clients and clients[0].hesitates():
+                        clients.pop(0).answer({"error": "silent where others wait, and there is room for one"})
                     time.sleep(0.01)
                     continue
                 if len(clients) > CLIENTS:
@@ -263,7 +269,7 @@ class ControlServer:
             OSError: there is none, or no room for it.
         """
         try:
-            accepted = self._server.accept()[0]
+            return self._server.accept()[0]
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise
@@ -272,9 +278,6 @@ class ControlServer:
                 raise
             self._give_up_reserve()
             return self._server.accept()[0]
-        if self._reserve is not None:
-            self._told = ""
-        return accepted
 
     def _take_reserve(self) -> None:
         """Hold a descriptor that the next client can have where there is no other: it may be the one who says stop."""
@@ -283,9 +286,9 @@ class ControlServer:
                 self._reserve = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
     def _give_up_reserve(self) -> None:
-        if self._reserve is not None:
-            os.close(self._reserve)
-            self._reserve = None
+        reserve, self._reserve = self._reserve, None
+        if reserve is not None:
+            os.close(reserve)
 
 
 class _Client:
@@ -299,6 +302,10 @@ class _Client:
 
     def fileno(self) -> int:
         return self.socket.fileno()
+
+    def hesitates(self) -> bool:
+        """Whether its line is not there yet though others wait."""
+        return self.deadline - time.monotonic() < PATIENCE - HASTE
 
     def hear(self, driver: Driver) -> bool:
         """Take what has come, and do what it says once it is a line; False if more is to come."""
@@ -333,6 +340,14 @@ class _Client:
                 self.socket.sendall(json.dumps(reply).encode() + b"\n")
             except OSError as error:
                 log.warning("control client: %s", error)
+
+
+def _ready(heard: Iterable[socket.socket | _Client], wait: float | None) -> set[int]:
+    """The descriptors at which there is something to read, after at most `wait` [s]; their numbers may be large."""
+    poll = select.poll()
+    for each in heard:
+        poll.register(each, select.POLLIN)
+    return {descriptor for descriptor, _ in poll.poll(None if wait is None else math.ceil(1e3 * wait))}
 
 
 def tell(path: Path, command: str) -> dict[str, Any]:

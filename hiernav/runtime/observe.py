@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -121,11 +123,18 @@ class Audience:
             except Exception as error:
                 self.observers.remove(observer)
                 name = type(observer).__name__
-                self.dropped.setdefault(name, f"{type(error).__name__}: {error}".removesuffix(": "))
                 log.exception("%s failed and is dropped", name)
+                self.dropped.setdefault(name, _said(error))
 
     def emit(self, kind: str, text: str, now: float, **values: float | int | str | bool | None) -> None:
         """Tell of an event."""
         if self.observers:
             event = Event(now, kind, text, values)
             self.tell(lambda observer: observer.event(event))
+
+
+def _said(error: Exception) -> str:
+    """What an error says of itself, which it may be unable to."""
+    with suppress(Exception):
+        return "".join(traceback.format_exception_only(error)).strip()
+    return type(error).__name__

@@ -53,4 +53,8 @@ def test_an_entry_of_another_world_or_other_settings_has_a_planner_and_a_data_se
     assert made("pillar(1.2,1.2,2)") == {"paper", "data"}
     assert made("two-room(1.2,1.2)") == {"paper", "data"}
     assert made("two-room(1.2,1.2)", "planner.epochs=2") == {"paper"}, "the same labels serve longer trainings"
+    notes = {file: file.read_text() for file in tmp_path.glob("*/commits.txt")}
+    assert len(notes) == 3
+    monkeypatch.setattr("hiernav.run.package_state", lambda: ("another", False))
     assert made("two-room(1.2,1.2)") == set()
+    assert {file: file.read_text() for file in notes} == notes, "it walked, and trained nothing"

@@ -706,10 +706,23 @@ class Broken(Observer):
         raise OSError("disk full")
 
 
+class Unsayable(Observer):
+    """Raises an error that cannot say what it is."""
+
+    def tick(self, record: TickRecord) -> None:
+        class Mute(Exception):
+            def __str__(self) -> str:
+                raise RuntimeError
+
+        raise Mute
+
+
 def test_observers_see_every_tick_and_a_failing_one_does_not_stop_the_robot():
     seen = Listener()
-    result = driver_of(observers=[Broken(), seen]).run(GOAL)
-    assert result.reached
+    driver = driver_of(observers=[Broken(), Unsayable(), seen])
+    result = driver.run(GOAL)
+    assert result.reached and driver.supervisor.fault is None
+    assert driver.audience.dropped["Broken"] == "OSError: disk full" and "Mute" in driver.audience.dropped["Unsayable"]
     assert [record.index for record in seen.records] == list(range(result.steps + 1))
     assert all(record.mode is Mode.RUNNING and record.sent is not None for record in seen.records[:-1])
     assert seen.records[-1].sent is None
