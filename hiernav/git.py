@@ -10,7 +10,6 @@ from pathlib import Path
 Code = tuple[str | None, bool | None]
 """The commit, and whether it is other code than that; None and None where there is no git."""
 
-
 PATIENCE = 10.0
 """For git, which may wait for a disk that is not there [s]."""
 _ELSEWHERE = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")

@@ -49,11 +49,8 @@ KINDS = {
     "two-room": Kind(300.0, (0.8, 0.9), "W,H", (2.0, 2.0, 0)),
     "four-room": Kind(300.0, (1.4, 1.4), "W,H", (2.0, 2.0, 0)),
 }
-_TEXTS = [
-    *(text for name, kind in KINDS.items() for text in (kind.default and name, f"{name}({kind.arguments})") if text),
-    "map(FILE.yaml)",
-]
-_ACCEPTED = f"accepted are {', '.join(_TEXTS)} and FILE.yaml"
+_TEXTS = [([name] if kind.default else []) + [f"{name}({kind.arguments})"] for name, kind in KINDS.items()]
+_ACCEPTED = f"accepted are {', '.join(sum(_TEXTS, []))}, map(FILE.yaml) and FILE.yaml"
 
 
 @dataclass(frozen=True)
