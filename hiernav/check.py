@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 
 from hiernav.config import ConfigError, TrainConfig
 from hiernav.nav.mirror import mirror_of
 from hiernav.planner.mix import WorldRange
 from hiernav.run import check_stage
+from hiernav.sim.batch import processors
 from hiernav.sim.factory import expert_planner, skill_layout
 from hiernav.sim.layout import parse_world
 from hiernav.sim.robots import get_robot
@@ -74,14 +74,13 @@ def check_worlds(config: TrainConfig) -> None:
 
 def check_threads(config: TrainConfig) -> None:
     """Warn of more threads than there are processors to run them."""
-    # there is no such call on macOS
-    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    there = processors()
     if config.threads > there:
-        processors = "1 processor" if there == 1 else f"{there} processors"
+        use = "1 processor" if there == 1 else f"{there} processors"
         log.warning(
             "threads = %d, but this process may use %s: more threads than that gain no speed and cost memory",
             config.threads,
-            processors,
+            use,
         )
 
 

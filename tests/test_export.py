@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch", reason="needs the extra hiernav[train]")
 onnx = pytest.importorskip("onnx", reason="needs the extra hiernav[train]")
 
 from hiernav import export  # noqa: E402
-from hiernav.config import load_config  # noqa: E402
+from hiernav.config import dump_config, load_config  # noqa: E402
 from hiernav.evaluate import Policies, make_planner, open_policies  # noqa: E402
 from hiernav.export import export_run, record_inputs  # noqa: E402
 from hiernav.nav.bundle import HASHED_FILES, MANIFEST, BundleError, file_sha256, load_bundle  # noqa: E402
@@ -157,6 +157,14 @@ def test_the_manifest_tells_which_code_trained_and_with_which_settings(able_run,
     provenance = load_bundle(export_run(run.path, tmp_path / "bundle")).manifest.provenance
     assert provenance["code"] == f"{began}, abc with changes"
     assert load_config(None, shlex.split(provenance["settings"])) == msgspec.structs.replace(run.config, run_dir=None)
+
+
+def test_the_manifest_names_no_place_of_the_machine_that_trained(able_run, tmp_path):
+    run = Path(shutil.copytree(able_run, tmp_path / "run"))
+    private = ["planner.data=/home/somebody/data", "skill.ray_address=ray://10.0.0.7:10001", "skill.collector=ray"]
+    (run / "config.yaml").write_text(dump_config(load_config(run / "config.yaml", private)))
+    settings = str(load_bundle(export_run(run, tmp_path / "bundle")).manifest.provenance["settings"])
+    assert 'skill.collector="ray"' in settings and "somebody" not in settings and "10.0.0.7" not in settings
 
 
 def test_the_manifest_holds_the_rule_and_the_plans_as_they_were_configured(able_run, tmp_path, monkeypatch):

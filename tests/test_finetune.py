@@ -99,8 +99,6 @@ def test_a_fine_tuned_bundle_tells_that_it_is_one_and_which_code_trained_what_it
     assert "settings" not in told and "planner.samples" in str(told["fine_tuned_with"])
     config = fine_tuning_config(tmp_path / "bundle", [f"run_dir={tmp_path / 'again'}"])
     assert begin_fine_tuning(config, tmp_path / "bundle").codes() == str(told["code"]).split(", ")
-    manifest = json.loads((tmp_path / "bundle" / "manifest.json").read_text())
-    assert str(tmp_path) not in json.dumps(manifest), "no place of this machine is told"
 
 
 @pytest.mark.parametrize("stage", ["planner", "skill"])

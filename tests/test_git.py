@@ -1,5 +1,6 @@
 """Which code trained: a commit that is this package's, and none that is only around it."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -29,11 +30,11 @@ def repository(tmp_path):
     return tmp_path, git
 
 
-def told(folder: Path) -> str:
+def told(folder: Path, **environment: str) -> str:
     """What the package in `folder` says of itself, from elsewhere."""
     script = "from hiernav.git import code_name, package_state; print(code_name(package_state()))"
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd="/", env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin"},
+        [sys.executable, "-c", script], cwd="/", env={**os.environ, "PYTHONPATH": str(folder), **environment},
         check=True, capture_output=True, text=True,
     )  # fmt: skip
     return done.stdout.strip()
@@ -55,6 +56,22 @@ def test_a_package_installed_inside_another_repository_does_not_tell_its_commit(
     installed.mkdir(parents=True)
     shutil.copytree(folder / "hiernav", installed / "hiernav")
     assert told(installed) == "no repository"
+
+
+def test_neither_a_hook_of_another_repository_nor_a_file_of_any_name_is_in_the_way(repository, tmp_path_factory):
+    folder, git = repository
+    other = tmp_path_factory.mktemp("other")
+    subprocess.run(["git", "init", "-q", str(other)], check=True)
+    assert told(folder, GIT_DIR=str(other / ".git"), GIT_WORK_TREE=str(other)) == git("rev-parse", "HEAD")
+    git("config", "core.quotepath", "false")
+    name = os.fsencode(folder / "hiernav") + b"/caf\xe9.txt"
+    for text in (b"1", b"2"):
+        with open(name, "wb") as file:
+            file.write(text)
+        if text == b"1":
+            git("add", ".")
+            git("commit", "-q", "-m", "y")
+    assert told(folder) == f"{git('rev-parse', 'HEAD')} with changes"
 
 
 def test_a_code_is_named_also_where_it_is_not_known():

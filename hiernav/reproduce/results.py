@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,6 +12,7 @@ import msgspec
 
 from hiernav import __version__
 from hiernav.files import write_atomically
+from hiernav.sim.batch import processors
 
 _PACKAGES = ("numpy", "mujoco", "onnxruntime", "torch", "torchrl")
 
@@ -220,7 +220,7 @@ def this_machine() -> Machine:
         except PackageNotFoundError:
             pass
     system = f"{platform.system()} {platform.machine()}"
-    return Machine(cpu=_cpu(), cores=_cores(), system=system, versions=versions)
+    return Machine(cpu=_cpu(), cores=processors(), system=system, versions=versions)
 
 
 def _cpu() -> str:
@@ -229,10 +229,6 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or "unknown"
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _finite(value: Any) -> Any:

@@ -6,6 +6,7 @@ MuJoCo releases the interpreter lock meanwhile, so that threads step their share
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -177,3 +178,9 @@ def _history_values(model: mujoco.MjModel, sensor: str) -> slice:
     samples = int(model.sensor_history[index, 0])
     start = int(model.sensor_historyadr[index]) + 2 + samples
     return slice(start, start + samples)
+
+
+def processors() -> int:
+    """How many this process may use: more threads than that gain nothing."""
+    # there is no such call on macOS
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
