@@ -123,7 +123,7 @@ class HierarchicalAgent:
         Returns:
             The rows (M,) in which it is.
         """
-        moved = np.flatnonzero(path.distances(goal, self.option.goal) > self.option.goal_radius)
+        moved = (path.distances(goal, self.option.goal) > self.option.goal_radius).nonzero()[0]
         if len(moved):
             self.option.drop(moved)
             self.recovery.reset(moved)

@@ -9,7 +9,7 @@ robot's own machine by a dry run (`filter_check`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 X, Y, YAW, VX, VY, BIAS = range(6)
 POSITION = (X, Y)
@@ -94,7 +94,7 @@ class PlanarFilter:
         Returns:
             Whether the measurement was accepted; if not, nothing has changed.
         """
-        p, q = (self.P[index] for index in part)
+        p, q = (self.P[index].copy() for index in part)
         a, b, d = p[part[0]] + variance, p[part[1]], q[part[1]] + variance
         determinant = a * d - b * b
         first, second = residual
@@ -103,23 +103,22 @@ class PlanarFilter:
             return False
         gains = [((u * d - v * b) / determinant, (v * a - u * b) / determinant) for u, v in zip(p, q, strict=True)]
         self._apply([k * first + m * second for k, m in gains])
-        self.P = _mirrored(
-            [row[j] - k * p[j] - m * q[j] for j in range(i + 1)]
-            for i, (row, (k, m)) in enumerate(zip(self.P, gains, strict=True))
-        )
+        for i, (row, (k, m)) in enumerate(zip(self.P, gains, strict=True)):
+            for j in range(i + 1):
+                row[j] = self.P[j][i] = row[j] - k * p[j] - m * q[j]
         return True
 
     def correct_yaw(self, residual: float, variance: float, gate: float) -> bool:
         """Update with a measured heading; arguments as in `correct_pair`, `residual` in [-pi, pi)."""
-        column = self.P[YAW]
+        column = self.P[YAW].copy()
         spread = column[YAW] + variance
         if not 0.0 <= residual * residual / spread <= gate:
             return False
         gains = [u / spread for u in column]
         self._apply([k * residual for k in gains])
-        self.P = _mirrored(
-            [row[j] - k * column[j] for j in range(i + 1)] for i, (row, k) in enumerate(zip(self.P, gains, strict=True))
-        )
+        for i, (row, k) in enumerate(zip(self.P, gains, strict=True)):
+            for j in range(i + 1):
+                row[j] = self.P[j][i] = row[j] - k * column[j]
         return True
 
     def replace(self, part: Sequence[int], value: Sequence[float], variance: float) -> None:
@@ -139,16 +138,3 @@ class PlanarFilter:
 def wrap(angle: float) -> float:
     """`angle` [rad] in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def _mirrored(lower: Iterable[list[float]]) -> list[list[float]]:
-    """The symmetric matrix of a lower triangle, row by row."""
-    (a0,), (b0, b1), (c0, c1, c2), (d0, d1, d2, d3), (e0, e1, e2, e3, e4), (f0, f1, f2, f3, f4, f5) = lower
-    return [
-        [a0, b0, c0, d0, e0, f0],
-        [b0, b1, c1, d1, e1, f1],
-        [c0, c1, c2, d2, e2, f2],
-        [d0, d1, d2, d3, e3, f3],
-        [e0, e1, e2, e3, e4, f4],
-        [f0, f1, f2, f3, f4, f5],
-    ]

@@ -16,7 +16,10 @@ def is_sound(name: str, value: np.ndarray) -> bool:
     # One short call finds NaN, infinity and absurd numbers alike; the square of a length may be too strict by a factor.
     if not np.vdot(value, value) < _LIMIT:
         return False
-    return name != "lidar" or all(0.0 <= closeness <= 1.0 for closeness in value.ravel().tolist())
+    if name != "lidar":
+        return True
+    closeness = value.ravel().tolist()
+    return 0.0 <= min(closeness, default=0.0) and max(closeness, default=0.0) <= 1.0
 
 
 class TermHold:
