@@ -32,8 +32,11 @@ class Batches(Protocol):
     frames: int
     """Most transitions of a batch."""
 
-    def segment(self, steps: int, frames: int) -> Generator[TensorDict]:
-        """Batches (M,) of about `frames` transitions of fresh episodes, for a run that has `steps` of them so far."""
+    def segment(self, steps: int, frames: int, again: int = 0) -> Generator[TensorDict]:
+        """Batches (M,) of about `frames` transitions of fresh episodes, for a run that has `steps` of them so far.
+
+        `again` says how often that failed before: each time other worlds are drawn.
+        """
         ...
 
     def close(self) -> None:
@@ -57,9 +60,9 @@ class LocalBatches:
         self.task = make_task(config, skill.num_envs, planner, training=True)
         self._env = NavigationEnv(self.task)
 
-    def segment(self, steps: int, frames: int) -> Generator[TensorDict]:
+    def segment(self, steps: int, frames: int, again: int = 0) -> Generator[TensorDict]:
         skill = self.config.skill
-        self.task.draw_from(training_layouts(self.config, steps))
+        self.task.draw_from(training_layouts(self.config, *place_of(again, steps)))
         per_batch = frames_of_batch(skill.num_envs, frames)
         collector = Collector(
             self._env,
@@ -111,6 +114,11 @@ def segment_frames(skill: SkillConfig, steps: int) -> int:
 def random_batches(config: TrainConfig, steps: int, frames: int) -> int:
     """How many batches of `frames` are still to be collected with random actions, after `steps`."""
     return -(-max(0, config.skill.learning_starts - steps) // frames)
+
+
+def place_of(again: int, *place: int) -> tuple[int, ...]:
+    """A place in the run, whose first try is named as if there were no other."""
+    return (*place, again) if again else place
 
 
 def training_layouts(config: TrainConfig, steps: int, *place: int) -> RandomLayouts:

@@ -3,11 +3,12 @@
 The run is cut into segments of `segment_frames`. Each one starts from freshly drawn episodes and ends with a
 checkpoint, so a resumed run repeats exactly what an uninterrupted one would have done: physics need not be saved. Two
 things end that: a replay buffer that has wrapped (`Replay`), and a worker that has died, whose successors' worlds are
-not those that a resumed run draws for it.
+not those that a resumed run draws for it. A segment in which the physics broke is tried again in other worlds.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections import deque
@@ -21,6 +22,7 @@ from tensordict import TensorDict
 
 from hiernav.config import SkillConfig, TrainConfig
 from hiernav.device import Recorded, choose_device, random_state, restore_random_state
+from hiernav.files import write_json
 from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner
 from hiernav.nav.planners import COUNTS, VerifiedPlanner
@@ -180,6 +182,7 @@ class SkillTrainer:
         self.batches = make_batches(config, self.learner.policy, planner)
         layout, self._robot = skill_layout(config), get_robot(config.robot)
         self._replay_folder = run.path / "skill" / "replay"
+        self._broken_file = run.path / "skill" / "broken.json"
         with run.writing():
             self.replay = Replay(
                 self._replay_folder,
@@ -254,7 +257,7 @@ class SkillTrainer:
         frames = segment_frames(skill, self.steps)
         window: list[TensorDict] = []
         try:
-            with closing(self.batches.segment(self.steps, frames)) as batches:
+            with closing(self.batches.segment(first, frames, self._broken().get(str(first), 0))) as batches:
                 for data in batches:
                     data["next", "reward"] *= skill.reward_scale
                     self._episodes.add(data)
@@ -265,7 +268,8 @@ class SkillTrainer:
                     if on_progress is not None:
                         on_progress(self._progress((self.steps - first) / (time.perf_counter() - began)))
         except PhysicsDiverged as error:
-            raise self._diverged(str(error)) from error
+            self._note_broken(first)
+            raise self._diverged(str(error), "goes on from there in other worlds") from error
         self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
         seconds = time.perf_counter() - began
         rates = {"steps_per_second": self.steps - first, "updates_per_second": self.learner.updates - updates}
@@ -299,18 +303,31 @@ class SkillTrainer:
         if not self.learner.finite:  # the last update of all can break them without a trace in its losses
             broken.append("weights")
         if broken:
-            raise self._diverged(f"{', '.join(broken)} not finite after {self.learner.updates} updates")
+            file = self.run.path / "config.yaml"
+            raise self._diverged(
+                f"{', '.join(broken)} not finite after {self.learner.updates} updates",
+                f"repeats it, with another seed in {file} other worlds follow",
+            )
         return values
 
-    def _diverged(self, what: str) -> TrainingDiverged:
-        path = self.run.path
+    def _diverged(self, what: str, resumed: str) -> TrainingDiverged:
         kept = (
             "there is no checkpoint yet" if self._saved is None else f"the last checkpoint is of step {self._saved:,}"
         )
         return TrainingDiverged(
-            f"{what}; this was at step {self.steps:,} of training, and {kept}: `hiernav train --resume {path}` repeats "
-            f"it, with another seed in {path / 'config.yaml'} other worlds follow"
+            f"{what}; this was at step {self.steps:,} of training, and {kept}: "
+            f"`hiernav train --resume {self.run.path}` {resumed}"
         )
+
+    def _broken(self) -> dict[str, int]:
+        """How often the physics broke in the segment that begins after so many steps."""
+        return json.loads(self._broken_file.read_text()) if self._broken_file.exists() else {}
+
+    def _note_broken(self, steps: int) -> None:
+        times = self._broken()
+        times[str(steps)] = times.get(str(steps), 0) + 1
+        with self.run.writing():
+            write_json(self._broken_file, times)
 
     def _learn_from(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """One update on the transitions in those rows (B,) of the replay buffer, half of them reflected on request."""

@@ -22,7 +22,7 @@ from torchrl.modules import ProbabilisticActor
 from hiernav.config import TrainConfig
 from hiernav.nav.option import Planner
 from hiernav.run import WorkersLost
-from hiernav.skill.collect import frames_of_batch, random_batches, segment_frames, whole_batches
+from hiernav.skill.collect import frames_of_batch, place_of, random_batches, segment_frames, whole_batches
 from hiernav.skill.env import PhysicsDiverged
 from hiernav.skill.machines import Machines, Weights, find_machines
 
@@ -45,20 +45,20 @@ class WorkerBatches:
         self._pending: list[Future[TensorDict]] = []
         self._stopping = threading.Event()
 
-    def segment(self, steps: int, frames: int) -> Generator[TensorDict]:
+    def segment(self, steps: int, frames: int, again: int = 0) -> Generator[TensorDict]:
         if self._machines is None:
             self._machines = find_machines(self.config, self.share, self.planner)
             self.workers = [Worker(k, self.config, self._machines) for k in range(self.config.skill.workers)]
         begun, last = steps, steps + whole_batches(frames, self.frames) * self.frames
-        self._order(begun, steps)
+        self._order(begun, steps, again)
         while steps < last:
             data = torch.cat([share.result() for share in self._pending])
             steps += self.frames
             if self.config.skill.overlap and steps < last:
-                self._order(begun, steps)
+                self._order(begun, steps, again)
             yield data
             if not self.config.skill.overlap and steps < last:
-                self._order(begun, steps)
+                self._order(begun, steps, again)
 
     def close(self) -> None:
         self._stopping.set()
@@ -70,11 +70,11 @@ class WorkerBatches:
             self._machines.close()
             self._machines = None
 
-    def _order(self, segment: int, steps: int) -> None:
+    def _order(self, segment: int, steps: int, again: int) -> None:
         """Let all workers collect the batch that follows `steps`, by the weights of this moment."""
         random_frames = random_batches(self.config, steps, self.frames) * self.share
         weights = {key: value.numpy().copy() for key, value in self.policy.state_dict().items()}
-        order = Order(segment, random_frames, weights, self._stopping)
+        order = Order(segment, again, random_frames, weights, self._stopping)
         self._pending = [self._threads.submit(worker.collect, order) for worker in self.workers]
 
 
@@ -84,6 +84,8 @@ class Order:
 
     segment: int
     """Steps of the run before the segment."""
+    again: int
+    """How often it failed before."""
     random_frames: int
     """Frames that a worker which starts now acts at random for."""
     weights: Weights
@@ -141,7 +143,8 @@ class Worker:
             self.collector = self.machines.start(order.random_frames)
             self._shares, self._segment = iter(self.collector), -1
         if self._segment != order.segment:
-            self.collector.map_fn("begin", [(self.config, (order.segment, self.index, self.generation))])
+            place = place_of(order.again, order.segment, self.index, self.generation)
+            self.collector.map_fn("begin", [(self.config, place)])
             self._segment = order.segment
         self.collector.map_fn("load", [(order.weights,)])
         share = next(self._shares).reshape(-1)

@@ -8,7 +8,7 @@ import pytest
 
 from hiernav.config import load_config
 from hiernav.sim.layout import parse_world
-from hiernav.skill.collect import random_batches, segment_frames, training_layouts, training_worlds
+from hiernav.skill.collect import place_of, random_batches, segment_frames, training_layouts, training_worlds
 
 pytestmark = pytest.mark.train
 
@@ -101,6 +101,7 @@ def test_every_segment_and_every_worker_has_episodes_of_its_own() -> None:
         draw = training_layouts(CONFIG, *place)
         return [draw(row).seed for row in range(3)]
 
-    places = [seeds(0), seeds(256), seeds(256, 0, 0), seeds(256, 1, 0)]
-    assert len({seed for place in places for seed in place}) == 12
-    assert seeds(256, 1, 0) == places[-1]
+    named = [(0,), (256,), (256, 0, 0), (256, 1, 0)]
+    places = [seeds(*place_of(again, *place)) for place in named for again in (0, 1, 2)]
+    assert len({seed for place in places for seed in place}) == 36
+    assert seeds(256, 1, 0) == places[-3]

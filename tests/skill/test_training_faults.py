@@ -27,6 +27,7 @@ from hiernav.commands import exits  # noqa: E402
 from hiernav.run import Run, RunError, TrainingDiverged  # noqa: E402
 from hiernav.sim.layout import Layout, parse_world  # noqa: E402
 from hiernav.sim.worlds import sample_layout  # noqa: E402
+from hiernav.skill import collect  # noqa: E402
 from hiernav.skill import replay as replay_module  # noqa: E402
 from hiernav.skill.train import SkillTrainer  # noqa: E402
 
@@ -90,8 +91,31 @@ def test_physics_that_breaks_stops_training_and_names_the_episode(trained, at_st
     np.testing.assert_array_equal(drawn.pillars, layouts[0].pillars)
     np.testing.assert_array_equal(drawn.start, layouts[0].start)
     assert checkpoint_steps(tmp_path / "run") == 640
-    assert trained("--resume", str(tmp_path / "run"))[0] == 0
+
+
+def test_a_segment_in_which_physics_broke_is_tried_in_other_worlds(trained, at_step, tmp_path, monkeypatch):
+    draw, places = collect.training_layouts, []
+
+    def recorded(config, *place: int):
+        places.append(place)
+        return draw(config, *place)
+
+    def break_simulation(trainer: SkillTrainer) -> None:
+        trainer.batches.task.sim.datas[3].qvel[0] = np.nan
+
+    monkeypatch.setattr(collect, "training_layouts", recorded)
+    resume = f"hiernav train --resume {tmp_path / 'run'}"
+    arguments = tiny_run.arguments(tmp_path / "run", "skill.num_envs=4", "skill.total_steps=1280")
+    for steps in (896, 900):
+        at_step(steps, break_simulation)
+        code, line = trained(*arguments)
+        assert code == 1 and line.endswith(f"of step 640: `{resume}` goes on from there in other worlds")
+        arguments = ["--resume", str(tmp_path / "run")]
+    assert trained(*arguments)[0] == 0
     assert checkpoint_steps(tmp_path / "run") == 1280
+    assert places == [(0,), (640,), (640, 1), (640, 2)]
+    drawn = [draw(tiny_run.config(tmp_path / "other"), *place)(0).seed for place in places]
+    assert len(set(drawn)) == 4
 
 
 def test_weights_that_break_in_the_last_update_of_a_segment_do_not_reach_the_checkpoint(tmp_path):

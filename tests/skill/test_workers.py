@@ -108,11 +108,11 @@ def config(tmp_path: Path):
     return tiny_run.config(tmp_path, "skill.workers=2", "skill.num_envs=1", "skill.learning_starts=0")
 
 
-def order(segment: int = 0, random_frames: int = 0) -> Order:
-    return Order(segment, random_frames, {"weight": torch.zeros(()).numpy()}, threading.Event())
+def order(segment: int = 0, random_frames: int = 0, again: int = 0) -> Order:
+    return Order(segment, again, random_frames, {"weight": torch.zeros(()).numpy()}, threading.Event())
 
 
-def places(*shares: TensorDict) -> list[tuple[int, int, int]]:
+def places(*shares: TensorDict) -> list[tuple[int, ...]]:
     return [tuple(place) for share in shares for place in share["place"].tolist()]
 
 
@@ -185,6 +185,12 @@ def test_a_share_in_which_physics_broke_is_not_delivered(config) -> None:
     with pytest.raises(PhysicsDiverged, match="simulation 3"):
         worker.collect(order())
     assert len(machines.random_frames) == 1
+
+
+def test_a_segment_that_is_tried_again_has_other_worlds_in_every_worker(config) -> None:
+    machines = Scripted()
+    shares = [Worker(index, config, machines).collect(order(256, again=2)) for index in (0, 1)]
+    assert places(*shares) == [(256, 0, 0, 2), (256, 1, 0, 2)]
 
 
 @pytest.mark.parametrize(("overlap", "acted_by"), [("false", [0, 1, 2]), ("true", [0, 0, 1])])
