@@ -7,6 +7,7 @@ place of the segment in the run alone, so that a segment can be collected again 
 from __future__ import annotations
 
 from collections.abc import Generator
+from itertools import islice
 from typing import Protocol
 
 from tensordict import TensorDict
@@ -68,12 +69,12 @@ class LocalBatches:
             self._env,
             self.policy,
             frames_per_batch=per_batch,
-            total_frames=whole_batches(frames, per_batch) * per_batch,
+            total_frames=-1,  # one that comes to an end closes the simulations, which the next segment needs
             init_random_frames=random_batches(self.config, steps, per_batch) * per_batch,
             auto_register_policy_transforms=False,
         )
         try:
-            for data in collector:
+            for data in islice(collector, whole_batches(frames, per_batch)):
                 yield data.reshape(-1)
         finally:
             collector.shutdown(close_env=False)

@@ -85,6 +85,17 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> SkillTrainer:
     return trainer
 
 
+def test_with_two_threads_a_training_of_several_segments_is_the_same(tmp_path):
+    runs = []
+    for threads in (1, 2):
+        few = ("skill.num_envs=4", "skill.total_steps=1280", "skill.updates_per_step=0.02", "skill.eval_episodes=2")
+        trainer = trainer_in(tmp_path / str(threads), f"threads={threads}", *few)
+        trainer.train()
+        runs.append(metrics_of(trainer.run.path))
+    assert [line["step"] for line in runs[0] if line["stage"] == "skill"] == [640, 1280]
+    assert runs[0] == runs[1]
+
+
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[SkillTrainer, Path, dict[str, int]]:
     """The same run, stopped in the middle of its second segment and gone on with; what was on disk in between."""
