@@ -16,6 +16,7 @@ pytest.importorskip("torchrl", reason="needs the extra hiernav[train]")
 
 from tensordict import TensorDict  # noqa: E402
 
+from hiernav.config import load_config  # noqa: E402
 from hiernav.nav.mirror import mirror_of  # noqa: E402
 from hiernav.nav.option import Planner  # noqa: E402
 from hiernav.nav.planners import ShortestPathPlanner, StraightPlanner, VerifiedPlanner  # noqa: E402
@@ -28,6 +29,8 @@ from hiernav.skill.sac import Learner, SacSettings  # noqa: E402
 from hiernav.skill.train import Progress, SkillTrainer, TorchSkill, TrainingDiverged, kept, load_actor  # noqa: E402
 
 pytestmark = pytest.mark.train
+
+ROOT = Path(__file__).parents[2]
 
 
 def trainer_in(folder: Path, *overrides: str, planner: Planner | None = None) -> SkillTrainer:
@@ -85,15 +88,29 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> SkillTrainer:
     return trainer
 
 
+SHORT = (
+    "skill.num_envs=4", "skill.total_steps=1280", "skill.learning_starts=256", "skill.checkpoint_every_steps=256",
+    "skill.updates_per_step=0.02", "skill.batch_size=32", "skill.hidden=[32, 32]", "skill.eval_episodes=2",
+)  # fmt: skip
+"""Of any robot: two segments, of 640 steps each."""
+
+
 def test_with_two_threads_a_training_of_several_segments_is_the_same(tmp_path):
     runs = []
     for threads in (1, 2):
-        few = ("skill.num_envs=4", "skill.total_steps=1280", "skill.updates_per_step=0.02", "skill.eval_episodes=2")
-        trainer = trainer_in(tmp_path / str(threads), f"threads={threads}", *few)
+        trainer = trainer_in(tmp_path / str(threads), f"threads={threads}", *SHORT)
         trainer.train()
         runs.append(metrics_of(trainer.run.path))
     assert [line["step"] for line in runs[0] if line["stage"] == "skill"] == [640, 1280]
     assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_configuration_trains_for_more_than_a_segment(tmp_path, file):
+    run = Run.create(load_config(file, [*SHORT, "skill.stop_reach_rate=null", f"run_dir={tmp_path / 'run'}"]))
+    trainer = SkillTrainer(run.config, run)
+    trainer.train()
+    assert trainer.steps == 1280 and trainer.evaluations and trainer.best_actor is not None
 
 
 @pytest.fixture(scope="module")
