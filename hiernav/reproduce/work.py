@@ -22,7 +22,7 @@ from hiernav.film.writer import default_suffix
 from hiernav.git import Code, code_name
 from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key, training_hash
-from hiernav.run import Run, spent_seconds
+from hiernav.run import Run, TrainingDiverged, spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 
@@ -30,6 +30,8 @@ Report = Callable[[float, str], None]
 """Takes the share that is done, 0 to 1, and what is being done."""
 
 EVALUATION_SEED = 0
+BREAKS = 10
+"""Of the physics, with which a training is given up."""
 
 WALKERS = {"network": ("cnn", False), "verified": ("cnn", True), "astar": ("astar", False)}
 """Whose plans are walked along: planner, and whether what collides is repaired."""
@@ -294,10 +296,15 @@ def _run_dir(folder: Path) -> str:
 
 
 def _train_run(folder: Path, stage: str, report: Report, code: Code) -> None:
-    """Train a stage of a run folder from its last checkpoint on."""
+    """Train a stage of a run folder from its last checkpoint on, and on in other worlds where the physics breaks.
+
+    Raises:
+        TrainingDiverged: it breaks `BREAKS` times, or a loss or a weight is not finite.
+    """
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from hiernav.skill.env import PhysicsDiverged
     from hiernav.training import train
 
     class Reporting(Progress):
@@ -308,11 +315,16 @@ def _train_run(folder: Path, stage: str, report: Report, code: Code) -> None:
             task = self.tasks[task_id]
             report(task.completed / (task.total or 1.0), f"{task.description}: {changes.get('note', '')}")
 
-    run = Run.open(folder)
-    try:
-        train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True), code_name(code))
-    finally:
-        run.close()
+    for left in reversed(range(BREAKS)):
+        run = Run.open(folder)
+        try:
+            train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True), code_name(code))
+            return
+        except TrainingDiverged as error:
+            if not left or not isinstance(error.__cause__, PhysicsDiverged):
+                raise
+        finally:
+            run.close()
 
 
 def _curve(folder: Path, stage: str) -> list[dict[str, float | None]]:

@@ -9,11 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import tiny_run
 
 from hiernav.evaluate import evaluate, open_policies
 from hiernav.reproduce import child, queue, work
@@ -23,6 +25,7 @@ from hiernav.reproduce.experiments import SMOKE, catalogue
 from hiernav.reproduce.queue import Queue
 from hiernav.reproduce.results import read_result, read_results
 from hiernav.reproduce.work import Outcome, driven, run_cell, trained_seconds
+from hiernav.run import Run, TrainingDiverged
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 
@@ -158,6 +161,28 @@ def test_a_training_that_was_stopped_goes_on_from_its_checkpoint(places, capsys)
     assert outcome.settings["skill.precision"] in ("float32", "bfloat16")
     assert outcome.settings["skill.total_steps"] == 640 and "run_dir" not in outcome.settings
     assert outcome.metrics["strict"]["planner"] == "astar"
+
+
+@pytest.mark.train
+@pytest.mark.parametrize(
+    ("breaks", "physics", "tries"), [(0, True, 1), (3, True, 4), (99, True, work.BREAKS), (99, False, 1)]
+)
+def test_a_training_whose_physics_breaks_is_gone_on_with(tmp_path, monkeypatch, breaks, physics, tries):
+    from hiernav import training
+    from hiernav.skill.env import PhysicsDiverged
+
+    Run.create(tiny_run.config(tmp_path / "run")).close()
+    tried = []
+
+    def train(run: Run, *_: object) -> None:
+        tried.append(run.path)
+        if len(tried) <= breaks:
+            raise TrainingDiverged("at step 5") from (PhysicsDiverged("simulation 3") if physics else None)
+
+    monkeypatch.setattr(training, "train", train)
+    with pytest.raises(TrainingDiverged) if breaks == 99 else nullcontext():
+        work._train_run(tmp_path / "run", "skill", lambda *_: None, ("abc", False))
+    assert tried == tries * [tmp_path / "run"]
 
 
 @pytest.mark.parametrize("gpu", ["NVIDIA H100", None])
