@@ -102,7 +102,7 @@ MUTANTS = (
     Mutant("silent lidar", f"{R}/estimator.py", "for name, silence, flaw in self._terms.silences(self._stamp):",
            "for name, silence, flaw in ():",
            f"{F}/test_01_sensor_dropout.py"),
-    Mutant("lidar out of range", f"{R}/terms.py", "all(0.0 <= closeness <= 1.0 for", "all(True for",
+    Mutant("lidar out of range", f"{R}/terms.py", "return 0.0 <= min(closeness", "return True or 0.0 <= min(closeness",
            f"{F}/test_03_not_finite.py"),
     Mutant("no value but garbage", f"{R}/estimator.py", "if reading is None and value is not None:", "if False:",
            f"{F}/test_03_not_finite.py"),
