@@ -42,6 +42,10 @@ class TrainingDiverged(RuntimeError):
     """Losses, weights or physics are no longer finite; the last checkpoint is from before."""
 
 
+class PhysicsBroke(TrainingDiverged):
+    """It is the physics: a training that is resumed goes on in other worlds."""
+
+
 COMMITS = "commits.txt"
 UNKNOWN_CODE = "unknown"
 """Of what has trained without a note of it."""

@@ -22,7 +22,7 @@ from hiernav.film.writer import default_suffix
 from hiernav.git import Code, code_name
 from hiernav.planner import passes
 from hiernav.reproduce.cells import Cell, Kind, Places, bundle_hashes, cell_key, training_hash
-from hiernav.run import Run, TrainingDiverged, spent_seconds
+from hiernav.run import PhysicsBroke, Run, spent_seconds
 from hiernav.sim.layout import parse_world
 from hiernav.sim.rollout import Episode
 
@@ -304,7 +304,6 @@ def _train_run(folder: Path, stage: str, report: Report, code: Code) -> None:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from hiernav.skill.env import PhysicsDiverged
     from hiernav.training import train
 
     class Reporting(Progress):
@@ -320,8 +319,8 @@ def _train_run(folder: Path, stage: str, report: Report, code: Code) -> None:
         try:
             train(run, stage, Reporting(console=Console(file=sys.stdout, width=160), disable=True), code_name(code))
             return
-        except TrainingDiverged as error:
-            if not left or not isinstance(error.__cause__, PhysicsDiverged):
+        except PhysicsBroke:
+            if not left:
                 raise
         finally:
             run.close()

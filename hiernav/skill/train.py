@@ -27,7 +27,7 @@ from hiernav.nav.mirror import mirror_of
 from hiernav.nav.option import Planner
 from hiernav.nav.planners import COUNTS, VerifiedPlanner
 from hiernav.nav.termination import TerminationReason
-from hiernav.run import Run, RunError, TrainingDiverged
+from hiernav.run import PhysicsBroke, Run, RunError, TrainingDiverged
 from hiernav.sim.factory import make_task, skill_layout
 from hiernav.sim.layout import parse_world
 from hiernav.sim.reward import TERMS
@@ -269,7 +269,7 @@ class SkillTrainer:
                         on_progress(self._progress((self.steps - first) / (time.perf_counter() - began)))
         except PhysicsDiverged as error:
             self._note_broken(first)
-            raise self._diverged(str(error), "goes on from there in other worlds") from error
+            raise PhysicsBroke(self._ending(str(error), "goes on from there in other worlds")) from error
         self.run.log("skill", self.steps, {**metrics, **self._statistics(torch.cat(window))})
         seconds = time.perf_counter() - began
         rates = {"steps_per_second": self.steps - first, "updates_per_second": self.learner.updates - updates}
@@ -304,17 +304,16 @@ class SkillTrainer:
             broken.append("weights")
         if broken:
             file = self.run.path / "config.yaml"
-            raise self._diverged(
-                f"{', '.join(broken)} not finite after {self.learner.updates} updates",
-                f"repeats it, with another seed in {file} other worlds follow",
-            )
+            what = f"{', '.join(broken)} not finite after {self.learner.updates} updates"
+            raise TrainingDiverged(self._ending(what, f"repeats it, with another seed in {file} other worlds follow"))
         return values
 
-    def _diverged(self, what: str, resumed: str) -> TrainingDiverged:
+    def _ending(self, what: str, resumed: str) -> str:
+        """One line on what ended the training, and what resuming it does."""
         kept = (
             "there is no checkpoint yet" if self._saved is None else f"the last checkpoint is of step {self._saved:,}"
         )
-        return TrainingDiverged(
+        return (
             f"{what}; this was at step {self.steps:,} of training, and {kept}: "
             f"`hiernav train --resume {self.run.path}` {resumed}"
         )
